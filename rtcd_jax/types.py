@@ -1,0 +1,111 @@
+"""The nouns. Each contains the one before it; shapes are those of one candidate.
+
+A population is the same pytree with a leading axis P. `us` stands before `xs` because jaxtyping
+binds `N` at the first annotation and can evaluate `N+1` only afterwards.
+"""
+
+import enum
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+
+class Status(enum.IntEnum):
+    """Why a candidate has no funnel; `OK` if it has one. The first failure along the flow is kept."""
+
+    OK = 0
+    TRAJECTORY_NOT_SOLVED = 1
+    RICCATI_INDEFINITE = 2
+    FUNNEL_EMPTY = 3
+    NOT_FINITE = 4
+
+    @property
+    def message(self) -> str:
+        return _MESSAGES[self]
+
+
+_MESSAGES = {
+    Status.OK: "has a funnel",
+    Status.TRAJECTORY_NOT_SOLVED: "no start of the trajectory optimisation reached the tolerances on defects and boxes",
+    Status.RICCATI_INDEFINITE: "the Riccati equation has no positive definite solution along the trajectory",
+    Status.FUNNEL_EMPTY: "a knot's level fell below the smallest sampled level: some knot has no funnel",
+    Status.NOT_FINITE: "a number of the candidate's evaluation is not finite",
+}
+
+
+def first_failure(*statuses: Int[Array, ""]) -> Int[Array, ""]:
+    """The first status that is not `OK`, in the order of the flow."""
+    kept = jnp.asarray(statuses[0], jnp.int32)
+    for status in statuses[1:]:
+        kept = jnp.where(kept != Status.OK, kept, jnp.asarray(status, jnp.int32))
+    return kept
+
+
+class Candidate(eqx.Module):
+    """What the search chooses: the robot's design and the diagonals of the cost weights Q and R."""
+
+    design: eqx.Module
+    q: Float[Array, " n"]
+    r: Float[Array, " m"]
+
+
+class Trajectory(eqx.Module):
+    """A nominal motion on N intervals of equal length `dt` [s], the input held inside each interval.
+
+    `cost` is the transcription's objective, `defect` the largest one-interval residual
+    |x_{k+1} - Phi(x_k, u_k, dt)|, `iterations` those of the start that was kept.
+    """
+
+    us: Float[Array, "N m"]
+    xs: Float[Array, "N+1 n"]
+    dt: Float[Array, ""]
+    cost: Float[Array, ""]
+    defect: Float[Array, ""]
+    iterations: Int[Array, ""]
+    status: Int[Array, ""]
+
+
+class Policy(eqx.Module):
+    """u = clip(u*(t) - K(t) (x - x*(t))) about a trajectory; the last gain is the goal's own LQR.
+
+    `values` are S(t_k) of the continuous Riccati equation; V_k(x) = (x - x*_k)' S_k (x - x*_k).
+    """
+
+    trajectory: Trajectory
+    gains: Float[Array, "N+1 m n"]
+    values: Float[Array, "N+1 n n"]
+    status: Int[Array, ""]
+
+
+class Funnel(eqx.Module):
+    """B_k = {x : V_k(x) <= levels_k}. `trials` fresh states of B_k were rolled out without a failure."""
+
+    policy: Policy
+    levels: Float[Array, " N+1"]
+    trials: Int[Array, " N+1"]
+    status: Int[Array, ""]
+
+
+class Volumes(eqx.Module):
+    """Exact ellipsoid volumes of a funnel, in the product of the states' units.
+
+    `total` is the sum over the knots (the paper's objective), `integral` that over time [.. s],
+    `inlet` the first ellipsoid's, `geometric_mean` the one that an empty knot brings to zero.
+    """
+
+    per_knot: Float[Array, " N+1"]
+    total: Float[Array, ""]
+    integral: Float[Array, ""]
+    inlet: Float[Array, ""]
+    geometric_mean: Float[Array, ""]
+
+
+class Evaluation(eqx.Module):
+    """Everything that is known of one genome after one pass along the flow."""
+
+    genome: Float[Array, " d"]
+    candidate: Candidate
+    funnel: Funnel
+    volumes: Volumes
+    status: Int[Array, ""]
