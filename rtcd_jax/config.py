@@ -1,0 +1,404 @@
+"""The experiment: one YAML as frozen models, every key with its unit, its range and its default. Knows no JAX.
+
+`load` reads a file, `parse` a mapping; both raise `ConfigError` with everything that is wrong at once.
+"the paper" is Girlanda et al., ICRA 2024 (arXiv 2403.10966).
+"""
+
+import hashlib
+import inspect
+import json
+import re
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+from typing import Annotated, Any, ClassVar, Literal
+
+import yaml
+from pydantic import (
+    Field,
+    PlainValidator,
+    SerializeAsAny,
+    TypeAdapter,
+    ValidationError,
+    ValidationInfo,
+    field_validator,
+)
+
+from rtcd_jax.settings import ConfigError, Problem, Settings, closest, invalid, problems_of
+
+EXAMPLE = """\
+plant: {name: pendulum}
+task: {start: [0, 0], goal: [3.141592653589793, 0], state_limits: [6.283185307179586, 7]}
+design: {mass: {initial: 0.7, min: 0.6, max: 0.8}, length: {initial: 0.4, min: 0.4, max: 0.6}}
+weights:
+  q: [{initial: 10, min: 1, max: 10}, {initial: 1, min: 1, max: 10}]
+  r: [{initial: 0.1, min: 0.001, max: 10}]
+"""
+"""The shortest complete YAML: the paper's pendulum with the default settings."""
+
+
+class PlantConfig(Settings):
+    """A robot's physical constants. The class variables say what else a configuration must know of it."""
+
+    states: ClassVar[tuple[str, ...]]
+    inputs: ClassVar[tuple[str, ...]]
+    design: ClassVar[tuple[str, ...]]
+
+    name: str
+
+
+class PendulumConfig(PlantConfig):
+    states: ClassVar = ("theta", "theta_dot")
+    inputs: ClassVar = ("torque",)
+    design: ClassVar = ("mass", "length")
+
+    name: Literal["pendulum"] = Field("pendulum", description="torque-limited pendulum (paper, section III)")
+    damping: float = Field(0.1, ge=0, description="viscous friction at the pivot [N m s/rad]")
+    gravity: float = Field(9.81, gt=0, description="gravitational acceleration [m/s^2]")
+    torque_limit: float = Field(2.5, gt=0, description="largest |torque| of the motor [N m]")
+
+
+PLANTS: dict[str, type[PlantConfig]] = {"pendulum": PendulumConfig}
+
+
+def _read_plant(data: Any) -> PlantConfig:
+    if isinstance(data, PlantConfig):
+        return data
+    if not isinstance(data, Mapping) or "name" not in data:
+        raise invalid([Problem((), f"must be a mapping with a `name`; valid: {', '.join(PLANTS)}", data)])
+    name = data["name"]
+    if not isinstance(name, str) or name not in PLANTS:
+        raise invalid([Problem(("name",), f"unknown plant; {closest(name, tuple(PLANTS))}", name)])
+    return PLANTS[name].model_validate(data)
+
+
+class Variable(Settings):
+    """One searched number and its box."""
+
+    initial: float = Field(description="value of the initial candidate [unit of the variable]")
+    min: float = Field(description="lower end of the box [unit of the variable]")
+    max: float = Field(description="upper end of the box [unit of the variable]")
+    pinned: bool = Field(False, description="hold the initial value instead of searching")
+
+    @property
+    def free(self) -> bool:
+        """True if the search may move it."""
+        return not self.pinned and self.min < self.max
+
+    def problems(self) -> Iterator[Problem]:
+        if self.min > self.max:
+            yield Problem(("min",), f"must be <= max = {self.max:g}", self.min)
+        elif not self.min <= self.initial <= self.max:
+            yield Problem(("initial",), f"must lie in [min, max] = [{self.min:g}, {self.max:g}]", self.initial)
+
+
+# Strictness is for the numbers: YAML's lists become tuples.
+Numbers = Annotated[tuple[float, ...], Field(strict=False)]
+Limits = Annotated[tuple[Annotated[float, Field(gt=0, allow_inf_nan=True)], ...], Field(strict=False)]
+Variables = Annotated[tuple[Variable, ...], Field(strict=False)]
+
+
+class TaskConfig(Settings):
+    start: Numbers = Field(description="first state of the nominal motion, pinned [states' units]")
+    goal: Numbers = Field(description="last state of the nominal motion, pinned, an equilibrium [states' units]")
+    state_limits: Limits = Field(description="largest |x_i|, .inf for none; leaving them is a failure [states' units]")
+
+
+class WeightsConfig(Settings):
+    """Diagonals of the running cost's Q and R, searched on a log scale."""
+
+    q: Variables = Field(description="diagonal of Q, one variable for each state [1/(s state's unit^2)]")
+    r: Variables = Field(description="diagonal of R, one variable for each input [1/(s input's unit^2)]")
+
+
+class StepConfig(Settings):
+    min: float = Field(0.01, gt=0, description="shortest interval [s] (paper, section III)")
+    max: float = Field(0.1, gt=0, description="longest interval [s] (paper, section III)")
+
+    def problems(self) -> Iterator[Problem]:
+        if self.min >= self.max:
+            yield Problem(("min",), f"must be < max = {self.max:g}", self.min)
+
+
+class TrajectoryConfig(Settings):
+    knots: int = Field(51, ge=3, description="knots N+1 of the nominal motion [-] (paper, section III)")
+    step: StepConfig = Field(StepConfig(), description="box of the one free step that all intervals share [s]")
+    time_weight: float = Field(0.1, ge=0, description="w_t, the cost of duration [1/s] (paper, section III)")
+    substeps: int = Field(5, ge=1, description="RK4 steps of dynamics and Riccati equation inside an interval [-]")
+    max_iterations: int = Field(200, ge=1, description="iterations of the trajectory optimizer [-]")
+
+
+class GoalConfig(Settings):
+    """The region of attraction of the goal's LQR, from which the last level follows."""
+
+    directions: int = Field(64, ge=1, description="quasi-random directions about the goal [-]")
+    radii: int = Field(8, ge=2, description="radii along each direction [-]")
+    rounds: int = Field(3, ge=1, description="refinements of the level, each between its neighbouring radii [-]")
+    horizon: float = Field(8.0, gt=0, description="time within which a rollout must arrive [s]")
+    step: float = Field(0.02, gt=0, description="RK4 step of these rollouts [s]")
+
+    def problems(self) -> Iterator[Problem]:
+        if self.step >= self.horizon:
+            yield Problem(("step",), f"must be < horizon = {self.horizon:g}", self.step)
+
+
+class FunnelConfig(Settings):
+    rollouts: Literal["closed_form", "mjx", "mixed"] = Field("mixed", description="dynamics of the rollouts")
+    mjx_share: float = Field(0.01, ge=0, le=1, description="share of the fresh samples on MJX when mixed [-]")
+    directions: int = Field(48, ge=1, description="quasi-random directions at each knot [-]")
+    radii: int = Field(12, ge=2, description="log-spaced radii along each direction [-]")
+    steps: int = Field(8, ge=1, description="RK4 steps of a rollout inside an interval [-]")
+    trials: int = Field(64, ge=1, description="fresh uniform states of each final ellipsoid, at each knot [-]")
+    confidence: float = Field(0.99, gt=0, lt=1, description="1 - beta, jointly over the knots [-]")
+    goal: GoalConfig = Field(GoalConfig(), description="region of attraction of the goal's LQR")
+
+    def problems(self) -> Iterator[Problem]:
+        if self.rollouts == "mixed" and self.mjx_share == 0:
+            yield Problem(
+                ("mjx_share",), "must be > 0 when rollouts = 'mixed', or choose 'closed_form'", self.mjx_share
+            )
+
+
+class NestedConfig(Settings):
+    """The paper's two loops: an outer search over designs, each with an inner search over weights."""
+
+    designs: int = Field(8, ge=4, description="outer population; the inner one is population / designs [-]")
+    generations: int = Field(10, ge=1, description="inner generations for each design [-]")
+
+
+SMALLEST_POPULATION = 4
+"""CMA-ES needs two parents, the better half of its population."""
+
+
+class SearchConfig(Settings):
+    objective: Literal["sum", "integral", "inlet", "geometric_mean"] = Field("sum", description="volume to maximize")
+    mode: Literal["joint", "nested"] = Field("joint", description="one search over all, or weights inside designs")
+    population: int = Field(128, ge=SMALLEST_POPULATION, description="candidates in a generation [-]")
+    generations: int = Field(60, ge=1, description="generations of the search, the outer ones when nested [-]")
+    sigma: float = Field(0.3, gt=0, le=1, description="initial step size in the unit box [-]")
+    seed: int = Field(0, ge=0, lt=2**32, description="of all random numbers [-]")
+    chunk: int = Field(32, ge=1, description="candidates solved together, which bounds the memory [-]")
+    nested: NestedConfig = Field(NestedConfig(), description="budget of the two loops, used in mode nested alone")
+
+    def problems(self) -> Iterator[Problem]:
+        if self.mode != "nested":
+            return
+        designs = self.nested.designs
+        if self.population % designs:
+            yield Problem(("population",), f"must be a multiple of nested.designs = {designs}", self.population)
+        elif self.population // designs < SMALLEST_POPULATION:
+            smallest = SMALLEST_POPULATION * designs
+            yield Problem(("population",), f"must be >= {smallest} for nested.designs = {designs}", self.population)
+
+
+class ElitesConfig(Settings):
+    count: int = Field(8, ge=1, description="candidates kept and evaluated again [-]")
+    distance: float = Field(0.02, ge=0, lt=1, description="smallest distance between two of them in the unit box [-]")
+    trials: int = Field(2000, ge=1, description="fresh states at each knot of their evaluation [-]")
+    directions: int = Field(192, ge=1, description="fresh directions at each knot of their evaluation [-]")
+
+
+class CheckpointConfig(Settings):
+    seconds: float = Field(20.0, ge=0, description="least time between two saves [s]")
+
+
+class Config(Settings):
+    """Everything that defines a run."""
+
+    plant: Annotated[SerializeAsAny[PlantConfig], PlainValidator(_read_plant)] = Field(description="the robot")
+    task: TaskConfig = Field(description="from where to where, and within what")
+    design: dict[str, Variable] = Field(description="the plant's design fields by name")
+    weights: WeightsConfig = Field(description="cost weights, searched on a log scale")
+    trajectory: TrajectoryConfig = Field(TrajectoryConfig(), description="the nominal motion")
+    funnel: FunnelConfig = Field(FunnelConfig(), description="how the funnel is sampled")
+    search: SearchConfig = Field(SearchConfig(), description="CMA-ES over designs and weights")
+    elites: ElitesConfig = Field(ElitesConfig(), description="the archive of the best")
+    checkpoint: CheckpointConfig = Field(CheckpointConfig(), description="when the state is saved")
+
+    @field_validator("design")
+    @classmethod
+    def _in_plants_order(cls, design: dict[str, Variable], info: ValidationInfo) -> dict[str, Variable]:
+        names = info.data["plant"].design if "plant" in info.data else ()
+        known = {name: design[name] for name in names if name in design}
+        return known | design
+
+    def problems(self) -> Iterator[Problem]:
+        return _across_sections(dict(self))
+
+    def variables(self) -> dict[str, Variable]:
+        """Every variable by its dotted key: the design in the plant's order, then q, then r."""
+        found = {f"design.{name}": variable for name, variable in self.design.items()}
+        for letter, variables in self.weights:
+            found |= {f"weights.{letter}.{i}": variable for i, variable in enumerate(variables)}
+        return found
+
+
+def _sizes(plant: PlantConfig, task: TaskConfig) -> Iterator[Problem]:
+    for key, value in task:
+        yield from _size(("task", key), value, plant.states)
+
+
+def _weight_sizes(plant: PlantConfig, weights: WeightsConfig) -> Iterator[Problem]:
+    yield from _size(("weights", "q"), weights.q, plant.states)
+    yield from _size(("weights", "r"), weights.r, plant.inputs)
+
+
+def _size(path: tuple[str, ...], values: tuple, names: tuple[str, ...]) -> Iterator[Problem]:
+    if len(values) != len(names):
+        plural = "entry" if len(names) == 1 else "entries"
+        yield Problem(path, f"must have {len(names)} {plural} ({', '.join(names)}), has {len(values)}")
+
+
+def _ends(task: TaskConfig) -> Iterator[Problem]:
+    for key in ("start", "goal"):
+        for i, (value, limit) in enumerate(zip(getattr(task, key), task.state_limits, strict=False)):
+            if abs(value) > limit:
+                yield Problem(("task", key, i), f"must lie in [-{limit:g}, {limit:g}] (task.state_limits)", value)
+    if task.start == task.goal:
+        yield Problem(("task", "goal"), "must differ from task.start", task.goal)
+
+
+def _design_names(plant: PlantConfig, design: dict[str, Variable]) -> Iterator[Problem]:
+    for name in design:
+        if name not in plant.design:
+            yield Problem(("design", name), f"unknown design field of {plant.name}; {closest(name, plant.design)}")
+    for name in plant.design:
+        if name not in design:
+            yield Problem(("design", name), f"is missing; {plant.name}'s design is {', '.join(plant.design)}")
+
+
+def _positive_design(design: dict[str, Variable]) -> Iterator[Problem]:
+    for name, variable in design.items():
+        if variable.min <= 0:
+            yield Problem(("design", name, "min"), "must be > 0: masses and lengths are positive", variable.min)
+
+
+def _positive_weights(weights: WeightsConfig) -> Iterator[Problem]:
+    for letter, variables in weights:
+        for i, variable in enumerate(variables):
+            if variable.min <= 0:
+                yield Problem(("weights", letter, i, "min"), "must be > 0: weights have a log scale", variable.min)
+
+
+def _something_free(design: dict[str, Variable], weights: WeightsConfig, search: SearchConfig) -> Iterator[Problem]:
+    designs = any(variable.free for variable in design.values())
+    tunable = any(variable.free for variable in (*weights.q, *weights.r))
+    if not designs and not tunable:
+        yield Problem((), "nothing to search: every variable is pinned or has min = max")
+    elif search.mode == "nested" and not (designs and tunable):
+        text = "needs a free design variable and a free weight; use 'joint'"
+        yield Problem(("search", "mode"), text, search.mode)
+
+
+_ACROSS: tuple[Callable[..., Iterator[Problem]], ...] = (
+    _sizes,
+    _weight_sizes,
+    _ends,
+    _design_names,
+    _positive_design,
+    _positive_weights,
+    _something_free,
+)
+
+
+def _across_sections(sections: Mapping[str, Any]) -> Iterator[Problem]:
+    """Checks between sections; one runs as soon as all the sections that it names are there."""
+    for check in _ACROSS:
+        needed = inspect.signature(check).parameters
+        if needed.keys() <= sections.keys():
+            yield from check(**{name: sections[name] for name in needed})
+
+
+def _valid_sections(data: Mapping[str, Any], failed: set[str | int]) -> dict[str, Any]:
+    fields = {name: field for name, field in Config.model_fields.items() if name not in failed}
+    return {
+        name: TypeAdapter(Annotated[field.annotation, field]).validate_python(data[name])
+        if name in data
+        else field.default
+        for name, field in fields.items()
+    }
+
+
+def parse(data: Any, source: str = "configuration") -> Config:
+    """The configuration that a mapping describes; `ConfigError` names everything that is wrong with it."""
+    try:
+        return Config.model_validate(data)
+    except ValidationError as error:
+        problems = problems_of(error)
+    if isinstance(data, Mapping):
+        # pydantic checks between sections only if every section is valid: run those that can be run.
+        failed = {problem.path[0] for problem in problems if problem.path}
+        found = _across_sections(_valid_sections(data, failed))
+        problems += [problem for problem in found if problem not in problems]
+    raise ConfigError(problems, source)
+
+
+class _Loader(yaml.SafeLoader):
+    """PyYAML's safe loader, but 1e-3 is a number, as in YAML 1.2, and a key given twice is an error."""
+
+    def construct_mapping(self, node, deep=False):
+        seen = set()
+        for key, _ in node.value:
+            if key.value in seen:
+                raise yaml.MarkedYAMLError(problem=f"the key {key.value!r} is given twice", problem_mark=key.start_mark)
+            seen.add(key.value)
+        return super().construct_mapping(node, deep)
+
+
+_EXPONENT_WITHOUT_DOT = re.compile(r"[-+]?\d+[eE][-+]?\d+$")
+_Loader.add_implicit_resolver("tag:yaml.org,2002:float", _EXPONENT_WITHOUT_DOT, list("-+0123456789"))
+
+
+def parse_yaml(text: str, source: str = "configuration") -> Config:
+    """The configuration that a YAML text describes; `ConfigError` if it is no YAML or no valid configuration."""
+    try:
+        data = yaml.load(text, _Loader)
+    except yaml.MarkedYAMLError as error:
+        mark = error.problem_mark
+        place = f"line {mark.line + 1}, column {mark.column + 1}: " if mark else ""
+        raise ConfigError([Problem((), f"no valid YAML: {place}{error.problem}")], source) from None
+    except yaml.YAMLError as error:
+        raise ConfigError([Problem((), f"no valid YAML: {error}")], source) from None
+    return parse(data, source)
+
+
+def load(path: Path) -> Config:
+    """The configuration in a YAML file; `ConfigError` names everything that is wrong with it."""
+    if not path.is_file():
+        there = sorted(str(other) for other in path.parent.glob("*.y*ml"))
+        advice = closest(path, there) if there else f"{path.parent} has no YAML file"
+        raise ConfigError([Problem((), f"no such file; {advice}")], str(path))
+    return parse_yaml(path.read_text(encoding="utf-8"), str(path))
+
+
+def resolved(config: Config) -> dict[str, Any]:
+    """Every key with its value, defaults included, as plain mappings, lists and numbers."""
+    return json.loads(config.model_dump_json())
+
+
+def dump(config: Config) -> str:
+    """The resolved configuration as YAML; `parse_yaml` reads it back to an equal one."""
+    return yaml.safe_dump(resolved(config), sort_keys=False, default_flow_style=None, width=120)
+
+
+def config_hash(config: Config) -> str:
+    """Twelve hexadecimal digits of the SHA-256 of the canonical JSON: equal exactly for equal configurations."""
+    canonical = json.dumps(resolved(config), sort_keys=True, separators=(",", ":"))
+    return hashlib.sha256(canonical.encode()).hexdigest()[:12]
+
+
+def differences(old: Config, new: Config) -> dict[str, tuple[Any, Any]]:
+    """The dotted keys in which two configurations differ, with both values; None where a key is not there."""
+    before, after = _flat(resolved(old)), _flat(resolved(new))
+    keys = dict.fromkeys([*before, *after])
+    return {key: (before.get(key), after.get(key)) for key in keys if before.get(key) != after.get(key)}
+
+
+def _flat(tree: Any, path: str = "") -> dict[str, Any]:
+    if isinstance(tree, dict):
+        branches = tree.items()
+    elif isinstance(tree, list):
+        branches = enumerate(tree)
+    else:
+        return {path: tree}
+    prefix = f"{path}." if path else ""
+    return {key: leaf for name, branch in branches for key, leaf in _flat(branch, f"{prefix}{name}").items()}
