@@ -1,0 +1,112 @@
+"""What the benchmarks share: the clock's surroundings, rtcd_jax's compiled pipeline, its timing, a JSON file."""
+
+import datetime
+import json
+import os
+import platform
+import resource
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+RESULTS = Path(__file__).parent / "results"
+CONFIG = Path(__file__).parents[2] / "configs" / "pendulum_rtcd.yaml"
+
+
+def environment(*packages: str) -> dict[str, Any]:
+    """Date, processor, load and versions, without which a time means nothing."""
+    return {
+        "date": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
+        "cpu": cpu_model(),
+        "cores": os.cpu_count(),
+        "load_1min": round(os.getloadavg()[0], 2),
+        "python": platform.python_version(),
+        "versions": {name: metadata.version(name) for name in packages},
+    }
+
+
+def cpu_model() -> str:
+    info = Path("/proc/cpuinfo")
+    if not info.is_file():
+        return platform.processor() or platform.machine()
+    return next(line.split(":", 1)[1].strip() for line in info.read_text().splitlines() if "model name" in line)
+
+
+def save(name: str, record: dict[str, Any], folder: Path = RESULTS) -> Path:
+    folder.mkdir(parents=True, exist_ok=True)
+    path = folder / name
+    path.write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")
+    return path
+
+
+@dataclass(frozen=True)
+class Timed:
+    """One call: wall clock and CPU time of all threads [s]."""
+
+    wall: float
+    cpu: float
+
+
+def timed(call: Callable[[], Any]) -> tuple[Any, Timed]:
+    wall, cpu = time.perf_counter(), time.process_time()
+    value = call()
+    return value, Timed(time.perf_counter() - wall, time.process_time() - cpu)
+
+
+def peak_memory() -> int:
+    """Largest resident size of this process so far [bytes]."""
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
+
+
+@dataclass(frozen=True)
+class Measured:
+    """rtcd_jax's pipeline for one population: compilation, repeated calls on fresh genomes, memory [bytes]."""
+
+    population: int
+    compilation: Timed
+    calls: tuple[Timed, ...]
+    with_funnel: float
+    temporaries: int
+    resident_before: int
+    resident_peak: int
+
+
+def measure_pipeline(config: Path, population: int, repeats: int) -> Measured:
+    """Compile the evaluation of `population` genomes once, then time `repeats` calls, each with other genomes.
+
+    Genomes are uniform in the unit box of the search. `with_funnel` is the share of candidates whose status is OK.
+    """
+    import jax
+
+    jax.config.update("jax_enable_x64", True)
+    from rtcd_jax.evaluation import make_evaluate
+    from rtcd_jax.problem import make_problem
+
+    from rtcd_jax.config import load
+    from rtcd_jax.types import Status
+
+    settings = load(config)
+    evaluate = jax.jit(make_evaluate(make_problem(settings)))
+    shape = population, sum(variable.free for variable in settings.variables().values())
+    genomes = [jax.random.uniform(jax.random.key(i), shape) for i in range(repeats + 1)]
+    key = jax.random.key(repeats + 1)
+    compiled, compilation = timed(lambda: evaluate.lower(genomes[0], key).compile())
+    resident = peak_memory()
+    jax.block_until_ready(compiled(genomes[0], key))  # the first call pays for the allocation
+    calls, feasible = [], 0
+    for batch in genomes[1:]:
+        evaluations, call = timed(lambda batch=batch: jax.block_until_ready(compiled(batch, key)))
+        calls.append(call)
+        feasible += int((evaluations.status == Status.OK).sum())
+    return Measured(
+        population=population,
+        compilation=compilation,
+        calls=tuple(calls),
+        with_funnel=feasible / (repeats * population),
+        temporaries=compiled.memory_analysis().temp_size_in_bytes,
+        resident_before=resident,
+        resident_peak=peak_memory(),
+    )
