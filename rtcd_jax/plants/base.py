@@ -1,11 +1,14 @@
 """What a robot must say. All else (linearisation, rollouts, volumes) is derived from this."""
 
 import abc
+from collections.abc import Mapping
 from pathlib import Path
 from typing import ClassVar
 
 import equinox as eqx
 from jaxtyping import Array, Float
+
+ModelEdits = Mapping[str, Float[Array, "..."] | Mapping[str, Float[Array, "..."]]]
 
 
 class Plant(eqx.Module):
@@ -48,10 +51,21 @@ class Plant(eqx.Module):
     def parameters(self, design) -> dict[str, float]:
         """Every physical number of this robot by name, design included, in SI units."""
 
+    @classmethod
     @abc.abstractmethod
-    def edit_model(self, model, design) -> dict[str, Float[Array, " ..."]]:
-        """Leaves of the compiled MuJoCo model that `design` and the constants replace, by attribute name.
+    def from_parameters(cls, parameters: Mapping[str, float]) -> tuple["Plant", eqx.Module]:
+        """The plant and the design whose `parameters` these are.
 
-        `model` (an mjModel or mjx.Model) gives the leaves' current values; only leaves in which a
-        recompiled model would differ while contacts and joint limits are off may be named.
+        Raises:
+            KeyError: a parameter is missing.
+        """
+
+    @abc.abstractmethod
+    def edit_model(self, design) -> ModelEdits:
+        """What `design` and the constants replace in the MuJoCo model that `mjcf` compiles to.
+
+        Keyed by the model's attribute. The value is the whole attribute ("opt.gravity"), or its rows by
+        the name of the body (`body_*`), joint (`jnt_*`, `dof_*`) or geom (`geom_*`) that they belong to.
+        With contacts, joint limits and all other constraints off, the edited model must move as the
+        recompiled one: then derived attributes (`body_subtreemass`, `dof_invweight0`, ...) play no part.
         """

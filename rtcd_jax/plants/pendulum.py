@@ -3,6 +3,7 @@
 theta_ddot = (u - b theta_dot - m g l sin theta) / (m l^2): a point mass on a massless rod (paper, section III).
 """
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import ClassVar, final
 
@@ -10,7 +11,9 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from rtcd_jax.plants.base import Plant
+from rtcd_jax.plants.base import ModelEdits, Plant
+
+_ROD_RADIUS = 0.008  # [m], as drawn in pendulum.xml
 
 
 @final
@@ -60,5 +63,23 @@ class Pendulum(Plant):
             "torque_limit": self.torque_limit,
         }
 
-    def edit_model(self, model, design: PendulumDesign) -> dict[str, Float[Array, " ..."]]:
-        raise NotImplementedError
+    @classmethod
+    def from_parameters(cls, parameters: Mapping[str, float]) -> tuple["Pendulum", PendulumDesign]:
+        plant = cls(parameters["b"], parameters["g"], parameters["torque_limit"])
+        return plant, PendulumDesign(jnp.asarray(parameters["m"]), jnp.asarray(parameters["l"]))
+
+    def edit_model(self, design: PendulumDesign) -> ModelEdits:
+        bob = _downward(design.length)
+        rod_size = jnp.stack([jnp.full_like(design.length, _ROD_RADIUS), design.length / 2, 0 * design.length])
+        return {
+            "opt.gravity": _downward(jnp.asarray(self.gravity)),
+            "body_mass": {"bob": design.mass},
+            "body_ipos": {"bob": bob},
+            "dof_damping": {"theta": jnp.asarray(self.damping)},
+            "geom_pos": {"rod": bob / 2, "bob": bob},
+            "geom_size": {"rod": rod_size},
+        }
+
+
+def _downward(length: Float[Array, ""]) -> Float[Array, "3"]:
+    return jnp.stack([jnp.zeros_like(length), jnp.zeros_like(length), -length])

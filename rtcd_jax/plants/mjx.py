@@ -1,0 +1,235 @@
+"""MuJoCo at the border: a plant's MJCF as a compiled model, as an MJX step in pure JAX, as C accelerations.
+
+Nothing else in the package imports mujoco. The models have no contacts, joint limits, friction losses or
+equalities, so that M(q) a = tau(q, v, u) is all there is to solve, and a design may replace a handful of the
+model's leaves instead of being compiled anew. What would break this is refused by name.
+"""
+# pyright: reportAttributeAccessIssue=false
+# (mujoco ships no types for its native module.)
+
+import contextlib
+import copy
+import functools
+import io
+import operator
+from collections.abc import Iterator, Mapping
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+from jaxtyping import Array, DTypeLike, Float
+from mujoco.batch import Batch
+
+from rtcd_jax.plants.base import Plant
+
+with contextlib.redirect_stdout(io.StringIO()):  # a missing warp announces itself on stdout
+    from mujoco import mjx
+
+_OBJECTS = {
+    "body": mujoco.mjtObj.mjOBJ_BODY,
+    "jnt": mujoco.mjtObj.mjOBJ_JOINT,
+    "dof": mujoco.mjtObj.mjOBJ_JOINT,
+    "geom": mujoco.mjtObj.mjOBJ_GEOM,
+}
+
+_UNUSED = (  # of the smooth dynamics; SPRING stays on, because MJX drops the dampers with it
+    mujoco.mjtDisableBit.mjDSBL_CONSTRAINT
+    | mujoco.mjtDisableBit.mjDSBL_CONTACT
+    | mujoco.mjtDisableBit.mjDSBL_WARMSTART
+    | mujoco.mjtDisableBit.mjDSBL_SENSOR
+    | mujoco.mjtDisableBit.mjDSBL_CLAMPCTRL
+)
+
+
+def compile_model(plant: Plant, design: eqx.Module) -> mujoco.MjModel:
+    """The MuJoCo model of one concrete design, derived constants included: to simulate, export or render.
+
+    Raises:
+        ValueError: the MJCF is no smooth robot of this plant's sizes, or an edit names what it lacks.
+    """
+    model = copy.copy(_host_model(type(plant)))
+    with jax.enable_x64(True):
+        edits = jax.tree.map(np.asarray, plant.edit_model(design))
+    for attribute, edit in edits.items():
+        leaf = operator.attrgetter(attribute)(model)
+        if isinstance(edit, Mapping):
+            for name, row in edit.items():
+                leaf[_row(model, attribute, name)] = row
+        else:
+            leaf[:] = edit
+    mujoco.mj_setConst(model, mujoco.MjData(model))
+    return model
+
+
+class MjxStepper(eqx.Module):
+    """The plant's motion by MJX, for one design and one state; vmap it over both.
+
+    Everything is computed in the dtype of the state; strict dtype and rank promotion are suspended inside.
+
+    Raises:
+        ValueError: as `compile_model`.
+    """
+
+    plant: Plant
+    model: mjx.Model
+    data: mjx.Data
+
+    def __init__(self, plant: Plant):
+        self.plant = plant
+        self.model, self.data = _template(type(plant), jnp.dtype(jnp.result_type(float)))
+
+    def step(
+        self, design: eqx.Module, x: Float[Array, " n"], u: Float[Array, " m"], dt: Float[Array, ""] | float
+    ) -> Float[Array, " n"]:
+        """State (qpos, qvel) after one fourth-order Runge-Kutta step of `dt` [s], `u` held throughout."""
+        with _mjx_arithmetic(x.dtype):
+            model = self._edited_model(design, x.dtype)
+            model = model.tree_replace({"opt.timestep": jnp.asarray(dt, x.dtype)})
+            data = mjx.step(model, self._data_at(x, u))
+            return jnp.concatenate([data.qpos, data.qvel]).astype(x.dtype)
+
+    def dynamics(self, design: eqx.Module, x: Float[Array, " n"], u: Float[Array, " m"]) -> Float[Array, " n"]:
+        """State derivative (qvel, qacc): MJX in the place of `Plant.dynamics`."""
+        with _mjx_arithmetic(x.dtype):
+            data = mjx.forward(self._edited_model(design, x.dtype), self._data_at(x, u))
+            return jnp.concatenate([data.qvel, data.qacc]).astype(x.dtype)
+
+    def _edited_model(self, design: eqx.Module, dtype: DTypeLike) -> mjx.Model:
+        model = _cast(self.model, dtype)
+        leaves = {}
+        for attribute, edit in self.plant.edit_model(design).items():
+            leaf = operator.attrgetter(attribute)(model)
+            if isinstance(edit, Mapping):
+                for name, row in edit.items():
+                    leaf = leaf.at[_row(model, attribute, name)].set(row.astype(dtype))
+            else:
+                leaf = edit.astype(dtype)
+            leaves[attribute] = leaf
+        return model.tree_replace(leaves)
+
+    def _data_at(self, x: Float[Array, " n"], u: Float[Array, " m"]) -> mjx.Data:
+        qpos, qvel = jnp.split(x, 2)
+        return _cast(self.data, x.dtype).replace(qpos=qpos, qvel=qvel, ctrl=u.astype(x.dtype))
+
+
+class CpuDynamics:
+    """State derivatives of many states of one model by C MuJoCo, on all cores of this process.
+
+    It knows nothing of JAX: the independent witness of the closed form and of MJX.
+    """
+
+    def __init__(self, model: mujoco.MjModel, capacity: int):
+        self._batch = Batch(model, nsim=capacity)
+        self._fields = tuple(self._batch.bind(name) for name in ("qpos", "qvel", "ctrl", "qacc"))
+
+    def __call__(self, x: Float[np.ndarray, "states n"], u: Float[np.ndarray, "states m"]) -> np.ndarray:
+        """(qvel, qacc) [states n] for at most `capacity` states."""
+        states = len(x)
+        qpos, qvel, ctrl, qacc = (field[:states] for field in self._fields)
+        qpos[:], qvel[:] = np.split(x, 2, axis=1)
+        ctrl[:] = u
+        self._batch.forward(np.arange(states))
+        return np.concatenate([qvel, qacc], axis=1)
+
+
+@functools.cache
+def _host_model(robot: type[Plant]) -> mujoco.MjModel:
+    model = mujoco.MjModel.from_xml_path(str(robot.mjcf))
+    faults = [*_size_faults(robot, model), *_physics_faults(model)]
+    if faults:
+        raise ValueError(f"{robot.mjcf.name} is no smooth model of {robot.__name__}: {'; '.join(faults)}")
+    return model
+
+
+@functools.cache
+def _template(robot: type[Plant], dtype: np.dtype) -> tuple[mjx.Model, mjx.Data]:
+    """The MJX model and data as host arrays of `dtype`, so that they belong to no device and to no trace."""
+    model = copy.copy(_host_model(robot))
+    model.opt.disableflags |= _UNUSED
+    # L'DL written out elementwise: a batched dense Cholesky calls LAPACK once a lane on the CPU.
+    model.opt.jacobian = mujoco.mjtJacobian.mjJAC_SPARSE
+    with jax.ensure_compile_time_eval(), _mjx_arithmetic(dtype):
+        pair = mjx.put_model(model), mjx.make_data(model)
+        return jax.tree.map(lambda leaf: _as_float(np.asarray(leaf), dtype), pair)
+
+
+def _size_faults(robot: type[Plant], model: mujoco.MjModel) -> Iterator[str]:
+    n, m = len(robot.state_names), len(robot.input_names)
+    free = [_name(model, mujoco.mjtObj.mjOBJ_JOINT, i) for i in range(model.njnt) if model.jnt_type[i] < 2]
+    if free:
+        yield f"joint {', '.join(free)}: quaternions are no coordinates of a linear policy, use hinges and slides"
+    elif model.nq + model.nv != n:
+        yield f"it has {model.nq} positions and {model.nv} velocities, the plant {n} states"
+    if model.nu != m:
+        yield f"it has {model.nu} actuators, the plant {m} inputs"
+    if model.na:
+        yield f"it has {model.na} actuator states, and a plant none: use stateless motors"
+
+
+def _physics_faults(model: mujoco.MjModel) -> Iterator[str]:
+    objects = mujoco.mjtObj
+    if model.opt.integrator != mujoco.mjtIntegrator.mjINT_RK4:
+        yield 'its integrator must be <option integrator="RK4"/>'
+    own_limits = "a funnel checks the limits on its states itself"
+    own_clip = "the policy clips its inputs itself"
+    for fault, kind, present in (
+        (
+            "contacts are on (set contype and conaffinity to 0)",
+            objects.mjOBJ_GEOM,
+            (model.geom_contype != 0) | (model.geom_conaffinity != 0),
+        ),
+        ("contact pairs", objects.mjOBJ_PAIR, np.ones(model.npair)),
+        (f"joint limits are on ({own_limits})", objects.mjOBJ_JOINT, model.jnt_limited),
+        (f"tendon limits are on ({own_limits})", objects.mjOBJ_TENDON, model.tendon_limited),
+        ("friction loss, which is not smooth", objects.mjOBJ_JOINT, _of_joints(model, model.dof_frictionloss)),
+        ("friction loss, which is not smooth", objects.mjOBJ_TENDON, model.tendon_frictionloss),
+        ("equality constraints", objects.mjOBJ_EQUALITY, np.ones(model.neq)),
+        (f"control limits are on ({own_clip})", objects.mjOBJ_ACTUATOR, model.actuator_ctrllimited),
+        (f"force limits are on ({own_clip})", objects.mjOBJ_ACTUATOR, model.actuator_forcelimited),
+        (f"force limits are on ({own_clip})", objects.mjOBJ_JOINT, model.jnt_actfrclimited),
+    ):
+        names = [_name(model, kind, int(i)) for i in np.flatnonzero(present)]
+        if names:
+            yield f"{fault}: {_kind(kind)} {', '.join(names)}"
+
+
+def _of_joints(model: mujoco.MjModel, of_dofs: np.ndarray) -> np.ndarray:
+    return np.bincount(model.dof_jntid, weights=of_dofs != 0, minlength=model.njnt)
+
+
+def _kind(kind: mujoco.mjtObj) -> str:
+    return mujoco.mju_type2Str(kind)
+
+
+def _name(model: mujoco.MjModel, kind: mujoco.mjtObj, index: int) -> str:
+    return mujoco.mj_id2name(model, kind, index) or f"number {index}"
+
+
+def _row(model: mujoco.MjModel | mjx.Model, attribute: str, name: str) -> int:
+    """Index in `attribute` of the body, joint or geom called `name`."""
+    kind = _OBJECTS[attribute.split("_")[0]]
+    index = mjx.name2id(model, kind, name)
+    if index < 0:
+        raise ValueError(f"{attribute} is edited at {name!r}, but the model has no {_kind(kind)} of that name")
+    return int(model.jnt_dofadr[index]) if attribute.startswith("dof_") else index
+
+
+def _as_float(leaf, dtype: DTypeLike):
+    return leaf.astype(dtype) if jnp.issubdtype(leaf.dtype, jnp.floating) else leaf
+
+
+def _cast(tree, dtype: DTypeLike):
+    return jax.tree.map(lambda leaf: _as_float(jnp.asarray(leaf), dtype), tree)
+
+
+@contextlib.contextmanager
+def _mjx_arithmetic(dtype: DTypeLike) -> Iterator[None]:
+    """MJX relies on promotions that strict callers forbid, and mixes float64 into float32 where JAX allows both."""
+    with (
+        jax.numpy_rank_promotion("allow"),
+        jax.numpy_dtype_promotion("standard"),
+        jax.enable_x64(jnp.dtype(dtype) == jnp.float64),
+    ):
+        yield
