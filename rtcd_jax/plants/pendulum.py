@@ -11,6 +11,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from rtcd_jax.numerics.trigonometry import cos, sin
 from rtcd_jax.plants.base import ModelEdits, Plant
 
 _ROD_RADIUS = 0.008  # [m], as drawn in pendulum.xml
@@ -46,12 +47,12 @@ class Pendulum(Plant):
 
     def dynamics(self, design: PendulumDesign, x: Float[Array, "2"], u: Float[Array, "1"]) -> Float[Array, "2"]:
         inertia = design.mass * design.length**2
-        weight = design.mass * self.gravity * design.length * jnp.sin(x[0])
+        weight = design.mass * self.gravity * design.length * sin(x[0])
         return jnp.stack([x[1], (u[0] - self.damping * x[1] - weight) / inertia])
 
     def energy(self, design: PendulumDesign, x: Float[Array, "2"]) -> Float[Array, ""]:
         speed = design.length * x[1]
-        height = design.length * (1 - jnp.cos(x[0]))
+        height = design.length * (1 - cos(x[0]))
         return design.mass * (0.5 * speed**2 + self.gravity * height)
 
     def parameters(self, design: PendulumDesign) -> dict[str, float]:
