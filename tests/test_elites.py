@@ -6,29 +6,10 @@ import numpy as np
 import pytest
 
 from rtcd_jax import elites
-from rtcd_jax.plants.pendulum import PendulumDesign
-from rtcd_jax.types import Candidate, Evaluation, Funnel, Policy, Status, Trajectory, Volumes
+from rtcd_jax.types import Status, Volumes
+from tests.fake_evaluation import population
 
-N, CAPACITY, DISTANCE = 3, 5, 0.05
-
-
-def evaluate_one(genome, volume, status):
-    """A record whose every field depends on the genome, so that a mix-up of rows shows."""
-    mark = jnp.sum(genome * 10.0 ** jnp.arange(len(genome)))
-    xs = mark * jnp.ones((N + 1, 2))
-    values = mark * jnp.ones((N + 1, 2, 2))
-    counter = jnp.int32(7)
-    trajectory = Trajectory(mark * jnp.ones((N, 1)), xs, mark, mark, mark, counter, status)
-    policy = Policy(trajectory, mark * jnp.ones((N + 1, 1, 2)), values, status)
-    funnel = Funnel(policy, mark * jnp.ones(N + 1), jnp.full(N + 1, 9), status)
-    volumes = Volumes(volume * jnp.ones(N + 1), volume, 2 * volume, 1 / volume, volume**2)
-    candidate = Candidate(PendulumDesign(genome[0], genome[1]), mark * jnp.ones(2), mark * jnp.ones(1))
-    return Evaluation(genome, candidate, funnel, volumes, status)
-
-
-def population(genomes, volumes, statuses=None):
-    statuses = jnp.zeros(len(genomes), jnp.int32) if statuses is None else jnp.asarray(statuses, jnp.int32)
-    return jax.vmap(evaluate_one)(jnp.asarray(genomes), jnp.asarray(volumes, jnp.float64), statuses)
+CAPACITY, DISTANCE = 5, 0.05
 
 
 def random_population(seed, size=40, dimensions=2):

@@ -1,0 +1,231 @@
+"""ask -> evaluate -> tell -> elites, one generation at a time; no files, no clock, no devices.
+
+The search sees its problem through two functions alone, both deterministic:
+
+    evaluate(genomes [P, d], key) -> Evaluation     a population in the unit box, `key` its common random numbers
+    reevaluate(genomes [E, d], key) -> Evaluation   the elites once more, with more samples and fresh directions
+
+All randomness of a generation is fold_in(key(seed), index): the same state always has the same next state.
+"""
+
+import dataclasses
+import functools
+from collections.abc import Callable, Iterator
+from typing import final
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int, Key
+
+from rtcd_jax import cmaes, elites
+from rtcd_jax.cmaes import Stop
+from rtcd_jax.config import ElitesConfig, SearchConfig
+from rtcd_jax.elites import Elites
+from rtcd_jax.loops import Joint, Nested, NestedState
+from rtcd_jax.settings import UserError
+from rtcd_jax.types import Evaluation, Status
+
+Evaluate = Callable[[Float[Array, "P d"], Key[Array, ""]], Evaluation]
+
+# Generations after which a search without any feasible candidate is given up.
+PATIENCE = 10
+
+
+class NothingFeasible(UserError):
+    """Not one candidate so far has a funnel; `counts` says how many failed for which reason."""
+
+    def __init__(self, counts: dict[Status, int], generations: int):
+        self.counts = counts
+        reasons = [f"  {count} {status.name}: {status.message}" for status, count in counts.items() if count]
+        head = f"nothing is feasible: none of {sum(counts.values())} candidates in {generations} generations"
+        super().__init__("\n".join([head, *reasons]))
+
+
+@final
+@dataclasses.dataclass(frozen=True)
+class Plan:
+    """What is fixed during a search. `initial` is the first genome, `design` tells its design entries from weights.
+
+    Raises ValueError if the initial genome is empty or outside the unit box, or if nested loops lack a design
+    variable or a weight.
+    """
+
+    settings: SearchConfig
+    elites: ElitesConfig
+    initial: tuple[float, ...]
+    design: tuple[bool, ...]
+
+    def __post_init__(self):
+        if len(self.design) != len(self.initial):
+            raise ValueError(f"design has {len(self.design)} flags for {len(self.initial)} free variables")
+        outside = [f"{i}: {value}" for i, value in enumerate(self.initial) if not 0 <= value <= 1]
+        if outside:
+            raise ValueError(f"the initial genome leaves the unit box [0, 1] at {', '.join(outside)}")
+        _loop(self)  # refuses what cannot be searched, before anything is evaluated
+
+
+@final
+class SearchState(eqx.Module):
+    """All that a search must remember between two generations.
+
+    `generation` and `evaluations` count what is done; `counts` [len(Status)] are the candidates by status so far,
+    `restarts` those of all loops.
+    """
+
+    strategy: cmaes.State | NestedState
+    elites: Elites
+    generation: Int[Array, ""]
+    evaluations: Int[Array, ""]
+    restarts: Int[Array, ""]
+    counts: Int[Array, " statuses"]
+
+
+@final
+@dataclasses.dataclass(frozen=True)
+class Generation:
+    """What one generation found, on the host; volumes are NaN where a candidate failed.
+
+    `volumes` are [P] each by the objectives' names; `best` and `median` (over the feasible) are those of `objective`
+    in this generation, `best_so_far` that of the archive (all sampled rung); `feasible` is a share, `counts` and
+    `stops` leave out what did not occur; `sigma` is the (outer) step size [box widths], `evaluations` and `restarts`
+    count from the search's start.
+    """
+
+    index: int
+    evaluations: int
+    objective: str
+    best: float
+    median: float
+    best_so_far: float
+    feasible: float
+    counts: dict[str, int]
+    sigma: float
+    restarts: int
+    stops: dict[str, int]
+    genomes: np.ndarray
+    statuses: np.ndarray
+    volumes: dict[str, np.ndarray]
+
+
+def start(plan: Plan, example: Evaluation) -> SearchState:
+    """The state before generation 0. `example` is an evaluated population of any size, or its shapes."""
+    zero = jnp.zeros((), jnp.int32)
+    return SearchState(
+        strategy=_loop(plan).start(),
+        elites=elites.empty(plan.elites.count, example),
+        generation=zero,
+        evaluations=zero,
+        restarts=zero,
+        counts=jnp.zeros(len(Status), jnp.int32),
+    )
+
+
+def step(plan: Plan, evaluate: Evaluate, state: SearchState) -> tuple[SearchState, Generation]:
+    """One generation: P candidates asked for, evaluated, told, and merged into the elites."""
+    draw, directions, anew = jax.random.split(_key(plan, state.generation), 3)
+    strategy, points, genomes = _ask(plan, state.strategy, draw)
+    evaluation = evaluate(genomes, directions)
+    after, stops = _tell(plan, state, strategy, points, evaluation, anew)
+    return after, _record(plan, after, evaluation, np.asarray(stops))
+
+
+def run(plan: Plan, evaluate: Evaluate, state: SearchState) -> Iterator[tuple[SearchState, Generation]]:
+    """The generations that are left from `state` on, each with the state after it.
+
+    Raises NothingFeasible once `PATIENCE` generations (or all, if fewer) have passed without any feasible candidate.
+    """
+    total = plan.settings.generations
+    while True:
+        done = int(state.generation)
+        if done >= min(PATIENCE, total) and not int(state.elites.count):
+            raise NothingFeasible({status: int(state.counts[status]) for status in Status}, done)
+        if done >= total:
+            return
+        state, generation = step(plan, evaluate, state)
+        yield state, generation
+
+
+def finish(plan: Plan, reevaluate: Evaluate, state: SearchState) -> Elites:
+    """The elites by their second evaluation, sorted anew; those that fail it are dropped.
+
+    A sampled volume that won among thousands is likely to have been lucky: only the second one may be reported.
+    """
+    first = state.elites
+    evaluation = reevaluate(first.evaluation.genome, _key(plan, plan.settings.generations))
+    status = jnp.where(jnp.isfinite(first.costs), evaluation.status, jnp.int32(Status.NOT_FINITE))
+    evaluation = eqx.tree_at(lambda e: e.status, evaluation, status)
+    none = elites.empty(plan.elites.count, evaluation)
+    return elites.merge(none, evaluation, plan.settings.objective, first.generations, distance=0.0)
+
+
+def _loop(plan: Plan) -> Joint | Nested:
+    settings = plan.settings
+    if settings.mode == "joint":
+        strategy = cmaes.Strategy(len(plan.initial), settings.population, settings.sigma)
+        return Joint(strategy, plan.initial)
+    return Nested.plan(
+        population=settings.population,
+        designs=settings.nested.designs,
+        generations=settings.nested.generations,
+        sigma=settings.sigma,
+        initial=plan.initial,
+        design=plan.design,
+    )
+
+
+def _key(plan: Plan, generation: Int[Array, ""] | int) -> Key[Array, ""]:
+    return jax.random.fold_in(jax.random.key(plan.settings.seed), generation)
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def _ask(plan: Plan, strategy: cmaes.State | NestedState, key: Key[Array, ""]):
+    return _loop(plan).ask(strategy, key)
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def _tell(plan: Plan, state: SearchState, strategy, points, evaluation: Evaluation, key: Key[Array, ""]):
+    costs = elites.cost(evaluation, plan.settings.objective)
+    strategy, stops = _loop(plan).tell(strategy, points, costs, key)
+    best = elites.merge(state.elites, evaluation, plan.settings.objective, state.generation, plan.elites.distance)
+    after = SearchState(
+        strategy=strategy,
+        elites=best,
+        generation=state.generation + 1,
+        evaluations=state.evaluations + costs.shape[0],
+        restarts=state.restarts + jnp.sum(stops != Stop.NONE, dtype=jnp.int32),
+        counts=state.counts + jnp.bincount(evaluation.status, length=len(Status)).astype(jnp.int32),
+    )
+    return after, stops
+
+
+def _record(plan: Plan, after: SearchState, evaluation: Evaluation, stops: np.ndarray) -> Generation:
+    objective = plan.settings.objective
+    statuses = np.asarray(evaluation.status)
+    feasible = np.isfinite(np.asarray(elites.cost(evaluation, objective)))
+    volumes = {
+        name: np.where(feasible, np.asarray(elites.volume(evaluation.volumes, name)), np.nan)
+        for name in elites.OBJECTIVES
+    }
+    found = volumes[objective][feasible]
+    return Generation(
+        index=int(after.generation) - 1,
+        evaluations=int(after.evaluations),
+        objective=objective,
+        best=float(found.max()) if found.size else float("nan"),
+        median=float(np.median(found)) if found.size else float("nan"),
+        best_so_far=_best_so_far(after.elites, objective),
+        feasible=float(feasible.mean()),
+        counts={status.name: n for status in Status if (n := int(np.sum(statuses == status)))},
+        sigma=float(_loop(plan).sigma(after.strategy)),
+        restarts=int(after.restarts),
+        stops={reason.name: n for reason in Stop if reason and (n := int(np.sum(stops == reason)))},
+        genomes=np.asarray(evaluation.genome),
+        statuses=statuses,
+        volumes=volumes,
+    )
+
+
+def _best_so_far(found: Elites, objective: str) -> float:
+    return float(elites.volume(found.evaluation.volumes, objective)[0]) if int(found.count) else float("nan")
