@@ -8,7 +8,7 @@ import hashlib
 import inspect
 import json
 import re
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
 
@@ -23,7 +23,8 @@ from pydantic import (
     field_validator,
 )
 
-from rtcd_jax.settings import ConfigError, Problem, Settings, closest, invalid, problems_of
+from rtcd_jax.errors import ConfigError, Problem, closest
+from rtcd_jax.settings import Settings, invalid, problems_of
 
 EXAMPLE = """\
 plant: {name: pendulum}
@@ -36,20 +37,24 @@ weights:
 """The shortest complete YAML: the paper's pendulum with the default settings."""
 
 
-class PlantConfig(Settings):
-    """A robot's physical constants. The class variables say what else a configuration must know of it."""
+UNIT = "its unit"
+"""Stands in a description for the unit that the plant gives."""
 
-    states: ClassVar[tuple[str, ...]]
-    inputs: ClassVar[tuple[str, ...]]
-    design: ClassVar[tuple[str, ...]]
+
+class PlantConfig(Settings):
+    """A robot's physical constants. The class variables name its states, inputs and design fields, with units."""
+
+    states: ClassVar[dict[str, str]]
+    inputs: ClassVar[dict[str, str]]
+    design: ClassVar[dict[str, str]]
 
     name: str
 
 
 class PendulumConfig(PlantConfig):
-    states: ClassVar = ("theta", "theta_dot")
-    inputs: ClassVar = ("torque",)
-    design: ClassVar = ("mass", "length")
+    states: ClassVar = {"theta": "rad", "theta_dot": "rad/s"}
+    inputs: ClassVar = {"torque": "N m"}
+    design: ClassVar = {"mass": "kg", "length": "m"}
 
     name: Literal["pendulum"] = Field("pendulum", description="torque-limited pendulum (paper, section III)")
     damping: float = Field(0.1, ge=0, description="viscous friction at the pivot [N m s/rad]")
@@ -74,9 +79,9 @@ def _read_plant(data: Any) -> PlantConfig:
 class Variable(Settings):
     """One searched number and its box."""
 
-    initial: float = Field(description="value of the initial candidate [unit of the variable]")
-    min: float = Field(description="lower end of the box [unit of the variable]")
-    max: float = Field(description="upper end of the box [unit of the variable]")
+    initial: float = Field(description=f"value of the initial candidate [{UNIT}]")
+    min: float = Field(description=f"lower end of the box [{UNIT}]")
+    max: float = Field(description=f"upper end of the box [{UNIT}]")
     pinned: bool = Field(False, description="hold the initial value instead of searching")
 
     @property
@@ -98,9 +103,9 @@ Variables = Annotated[tuple[Variable, ...], Field(strict=False)]
 
 
 class TaskConfig(Settings):
-    start: Numbers = Field(description="first state of the nominal motion, pinned [states' units]")
-    goal: Numbers = Field(description="last state of the nominal motion, pinned, an equilibrium [states' units]")
-    state_limits: Limits = Field(description="largest |x_i|, .inf for none; leaving them is a failure [states' units]")
+    start: Numbers = Field(description=f"first state of the nominal motion, pinned [{UNIT}]")
+    goal: Numbers = Field(description=f"last state of the nominal motion, pinned, an equilibrium [{UNIT}]")
+    state_limits: Limits = Field(description=f"largest |x_i|, .inf for none; leaving them is a failure [{UNIT}]")
 
 
 class WeightsConfig(Settings):
@@ -242,7 +247,7 @@ def _weight_sizes(plant: PlantConfig, weights: WeightsConfig) -> Iterator[Proble
     yield from _size(("weights", "r"), weights.r, plant.inputs)
 
 
-def _size(path: tuple[str, ...], values: tuple, names: tuple[str, ...]) -> Iterator[Problem]:
+def _size(path: tuple[str, ...], values: tuple, names: Collection[str]) -> Iterator[Problem]:
     if len(values) != len(names):
         plural = "entry" if len(names) == 1 else "entries"
         yield Problem(path, f"must have {len(names)} {plural} ({', '.join(names)}), has {len(values)}")
@@ -260,7 +265,9 @@ def _ends(task: TaskConfig) -> Iterator[Problem]:
 def _design_names(plant: PlantConfig, design: dict[str, Variable]) -> Iterator[Problem]:
     for name in design:
         if name not in plant.design:
-            yield Problem(("design", name), f"unknown design field of {plant.name}; {closest(name, plant.design)}")
+            yield Problem(
+                ("design", name), f"unknown design field of {plant.name}; {closest(name, tuple(plant.design))}"
+            )
     for name in plant.design:
         if name not in design:
             yield Problem(("design", name), f"is missing; {plant.name}'s design is {', '.join(plant.design)}")

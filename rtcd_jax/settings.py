@@ -1,14 +1,14 @@
-"""Frozen pydantic models whose errors teach: the thing, its value, and what would have been right."""
+"""Frozen pydantic models that say what is wrong with their data in the words of `errors`."""
 
-import difflib
-from collections.abc import Iterable, Iterator, Sequence
-from typing import Any, NamedTuple, Self, get_args
+from collections.abc import Iterable, Iterator
+from typing import Self, get_args
 
 from pydantic import BaseModel, ConfigDict, ValidationError, model_validator
 from pydantic.fields import FieldInfo
 from pydantic_core import ErrorDetails, InitErrorDetails, PydanticCustomError
 
-_NO_VALUE = object()
+from rtcd_jax.errors import NO_VALUE, Problem, closest
+
 _KINDS = {
     "float_type": "a number",
     "int_type": "a whole number",
@@ -21,39 +21,6 @@ _KINDS = {
 }
 _BOUNDS = {"gt": ">", "ge": ">=", "lt": "<", "le": "<="}
 _BOUND_ERRORS = ("greater_than", "greater_than_equal", "less_than", "less_than_equal")
-_LONGEST_VALUE = 60
-
-
-class Problem(NamedTuple):
-    """What is wrong at one key. `value` is left out where there is none to show."""
-
-    path: tuple[str | int, ...]
-    text: str
-    value: Any = _NO_VALUE
-
-    def __str__(self) -> str:
-        key = ".".join(map(str, self.path)) or "the configuration"
-        if self.value is _NO_VALUE:
-            return f"{key}: {self.text}"
-        shown = repr(self.value)
-        if len(shown) > _LONGEST_VALUE:
-            shown = shown[: _LONGEST_VALUE - 1] + "…"
-        return f"{key} = {shown}: {self.text}"
-
-
-class UserError(ValueError):
-    """Something the user can mend: the command line shows its text alone, without a traceback."""
-
-
-class ConfigError(UserError):
-    """Everything that is wrong with a configuration, at once."""
-
-    def __init__(self, problems: Iterable[Problem], source: str = "configuration"):
-        self.problems = tuple(problems)
-        self.source = source
-        count = len(self.problems)
-        head = f"{source}: {count} error{'s' if count > 1 else ''}"
-        super().__init__("\n".join([head, *(f"  {problem}" for problem in self.problems)]))
 
 
 class Settings(BaseModel):
@@ -90,14 +57,6 @@ def problems_of(error: ValidationError) -> list[Problem]:
     return [_problem(details) for details in error.errors()]
 
 
-def closest(word: object, known: Sequence[str]) -> str:
-    """A sentence that names the valid words, led by the one that was probably meant."""
-    listed = ", ".join(known)
-    for match in difflib.get_close_matches(str(word).lower(), known, n=1):
-        return f"did you mean {match!r}? Valid: {listed}"
-    return f"valid: {listed}"
-
-
 def bounds(field: FieldInfo) -> str:
     """The field's own range, such as `> 0 and <= 1`; empty if it has none."""
     limits = ((sign, getattr(item, name, None)) for item in field.metadata for name, sign in _BOUNDS.items())
@@ -106,13 +65,13 @@ def bounds(field: FieldInfo) -> str:
 
 def _line(problem: Problem) -> InitErrorDetails:
     # The text travels in the context: pydantic would expand braces in a message template.
-    kind = PydanticCustomError("problem", "{text}", {"text": problem.text, "shown": problem.value is not _NO_VALUE})
-    return InitErrorDetails(type=kind, loc=problem.path, input=None if problem.value is _NO_VALUE else problem.value)
+    kind = PydanticCustomError("problem", "{text}", {"text": problem.text, "shown": problem.value is not NO_VALUE})
+    return InitErrorDetails(type=kind, loc=problem.path, input=None if problem.value is NO_VALUE else problem.value)
 
 
 def _problem(details: ErrorDetails) -> Problem:
     context = details.get("ctx", {})
-    return Problem(details["loc"], context["text"], details["input"] if context["shown"] else _NO_VALUE)
+    return Problem(details["loc"], context["text"], details["input"] if context["shown"] else NO_VALUE)
 
 
 def _taught(model: type[Settings], details: ErrorDetails) -> Problem:

@@ -1,0 +1,43 @@
+# `make run` and `make test` set everything up in .venv, by the standard library alone or by uv where it is there.
+
+VENV := .venv
+BIN := $(VENV)/bin
+RECENT := import sys; sys.exit(sys.version_info < (3, 11))
+PYTHON ?= $(shell for python in python3 python3.14 python3.13 python3.12 python3.11; do \
+	$$python -c '$(RECENT)' 2>/dev/null && { echo $$python; break; }; done)
+
+export JAX_COMPILATION_CACHE_DIR ?= $(CURDIR)/.jax_cache
+export JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS ?= 0
+export JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES ?= -1
+
+.PHONY: run test lint clean
+
+run: $(VENV)/installed
+	$(BIN)/rtcd optimize configs/pendulum_rtcd.yaml
+
+test: $(VENV)/installed-dev
+	$(BIN)/python -m pytest
+
+lint: $(VENV)/installed-dev
+	$(BIN)/ruff check
+	$(BIN)/ruff format --check
+	$(BIN)/pyright
+
+clean:
+	rm -rf $(VENV) .jax_cache .pytest_cache .ruff_cache
+
+$(VENV)/installed: pyproject.toml | $(BIN)/python
+	$(call install,.)
+	touch $@
+
+$(VENV)/installed-dev: pyproject.toml | $(BIN)/python
+	$(call install,'.[dev]')
+	touch $@ $(VENV)/installed
+
+$(BIN)/python:
+	@test -n '$(PYTHON)' || { echo 'rtcd_jax needs Python 3.11 or newer; found none. Say which: make PYTHON=/path/to/python3.12'; exit 1; }
+	@'$(PYTHON)' -c '$(RECENT)' || { echo 'rtcd_jax needs Python 3.11 or newer; $(PYTHON) is older'; exit 1; }
+	'$(PYTHON)' -m venv $(VENV) || { rm -rf $(VENV); echo 'No virtual environment: Debian and Ubuntu need the package python3-venv'; exit 1; }
+
+install = if command -v uv >/dev/null; then uv pip install --python $(BIN)/python -e $(1); \
+	else $(BIN)/python -m pip install --disable-pip-version-check -e $(1); fi

@@ -1,0 +1,102 @@
+"""The console script `rtcd`: one thin function for each verb.
+
+Exit codes: 0 done; 1 the result breaks its promise; 2 the input is wrong; 130 interrupted.
+Nothing heavy is imported before the input is known to be right.
+"""
+
+import os
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+from rtcd_jax.errors import UserError, closest
+
+OK, BROKEN_PROMISE, WRONG_INPUT, INTERRUPTED = 0, 1, 2, 130
+RUNS = Path("checkpoints")
+
+
+def optimize(arguments: Sequence[str]) -> int:
+    """search for the design and the weights with the largest funnel, or resume a search"""
+    from rtcd_jax.options import read_optimize
+
+    config, folder = read_optimize(arguments, RUNS)
+    _prepare_jax()
+    from rtcd_jax.console import Console
+    from rtcd_jax.run import optimize as run_optimize
+
+    with Console() as console:
+        run_optimize(config, folder, console)
+    return OK
+
+
+def verify(arguments: Sequence[str]) -> int:
+    """simulate fresh random states of a run's funnels with independent integrators"""
+    from rtcd_jax.options import read_verify
+
+    options = read_verify(arguments)
+    _prepare_jax()
+    from rtcd_jax.console import Console
+    from rtcd_jax.verify import verify_run
+
+    with Console() as console:
+        held = verify_run(options.run, options.states, options.seed, console)
+    return OK if held else BROKEN_PROMISE
+
+
+VERBS: dict[str, Callable[[Sequence[str]], int]] = {"optimize": optimize, "verify": verify}
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Runs one verb and returns the exit code; `--help` and unknown options of a verb exit by themselves."""
+    verb, *rest = (sys.argv[1:] if arguments is None else arguments) or ["--help"]
+    if verb in ("-h", "--help"):
+        print(_usage())
+        return OK
+    if verb == "--version":
+        print(_version())
+        return OK
+    try:
+        if verb not in VERBS:
+            raise UserError(f"unknown command {verb!r}; {closest(verb, tuple(VERBS))}")
+        return VERBS[verb](rest)
+    except UserError as error:
+        print(f"rtcd: {error}", file=sys.stderr)
+        return WRONG_INPUT
+    except KeyboardInterrupt:
+        print("stopped; run the same command to go on", file=sys.stderr)
+        return INTERRUPTED
+
+
+def _usage() -> str:
+    width = max(map(len, VERBS))
+    return "\n".join(
+        [
+            "usage: rtcd COMMAND …",
+            "",
+            "Robust co-design of underactuated robots.",
+            "",
+            *(f"  {name:{width}}  {verb.__doc__}" for name, verb in VERBS.items()),
+            "",
+            "`rtcd COMMAND --help` lists a command's options; `rtcd --version` prints the version.",
+        ]
+    )
+
+
+def _version() -> str:
+    from importlib.metadata import version
+
+    return f"rtcd {version('rtcd-jax')}"
+
+
+def _prepare_jax() -> None:
+    """Double precision, and one CPU device for each core that this process may use."""
+    import jax
+
+    jax.config.update("jax_enable_x64", True)
+    chosen = jax.config.jax_num_cpu_devices >= 0 or "host_platform_device_count" in os.environ.get("XLA_FLAGS", "")
+    if not chosen:
+        jax.config.update("jax_num_cpu_devices", _cores())
+
+
+def _cores() -> int:
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

@@ -1,0 +1,49 @@
+"""Errors that teach: the thing, its value, and what would have been right."""
+
+import difflib
+from collections.abc import Iterable, Sequence
+from typing import Any, NamedTuple
+
+NO_VALUE = object()
+"""Stands for a value where there is none to show."""
+_LONGEST_VALUE = 60
+
+
+class Problem(NamedTuple):
+    """What is wrong at one key, and the value that stands there."""
+
+    path: tuple[str | int, ...]
+    text: str
+    value: Any = NO_VALUE
+
+    def __str__(self) -> str:
+        key = ".".join(map(str, self.path)) or "the configuration"
+        if self.value is NO_VALUE:
+            return f"{key}: {self.text}"
+        shown = repr(self.value)
+        if len(shown) > _LONGEST_VALUE:
+            shown = shown[: _LONGEST_VALUE - 1] + "…"
+        return f"{key} = {shown}: {self.text}"
+
+
+class UserError(ValueError):
+    """Something the user can mend: the command line shows its text alone, without a traceback."""
+
+
+class ConfigError(UserError):
+    """Everything that is wrong with a configuration, at once."""
+
+    def __init__(self, problems: Iterable[Problem], source: str = "configuration"):
+        self.problems = tuple(problems)
+        self.source = source
+        count = len(self.problems)
+        head = f"{source}: {count} error{'s' if count > 1 else ''}"
+        super().__init__("\n".join([head, *(f"  {problem}" for problem in self.problems)]))
+
+
+def closest(word: object, known: Sequence[str]) -> str:
+    """A sentence that names the valid words, led by the one that was probably meant."""
+    listed = ", ".join(known)
+    for match in difflib.get_close_matches(str(word).lower(), known, n=1):
+        return f"did you mean {match!r}? Valid: {listed}"
+    return f"valid: {listed}"

@@ -1,0 +1,129 @@
+"""Command line → checked options, by tyro. Overrides are merged into the YAML's mapping and validated as one."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import tyro
+from pydantic.fields import FieldInfo
+from tyro.constructors import ConstructorRegistry, StructConstructorSpec, StructFieldSpec, StructTypeInfo
+
+from rtcd_jax.config import EXAMPLE, UNIT, Config, Variable, load, parse, parse_yaml
+from rtcd_jax.errors import UserError
+from rtcd_jax.settings import Settings, bounds
+
+OPTIMIZE_USAGE = "rtcd optimize CONFIG [--run FOLDER] [--KEY VALUE …]"
+
+
+@dataclass(frozen=True)
+class Branch:
+    """A node of the tree of options: tyro parses its fields, `collect` gathers their values in a plain container."""
+
+    fields: tuple[StructFieldSpec, ...]
+    collect: Callable[..., Any] = dict
+
+
+@dataclass(frozen=True)
+class OptimizeOptions:
+    """Search for the design and the weights with the largest funnel; the same command resumes a stopped run.
+
+    CONFIG comes first. Every key of the YAML is an option; without one, the defaults are those of the paper's pendulum.
+    """
+
+    config: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="CONFIG", help="the experiment, a YAML file")]
+    settings: Annotated[Branch, tyro.conf.arg(name="")]
+    run: Annotated[Path, tyro.conf.arg(metavar="FOLDER", help="run folder, resumed if it is there")]
+
+
+@dataclass(frozen=True)
+class VerifyOptions:
+    """Simulate fresh random states of a run's funnels with independent integrators; exit code 1 if too many fail."""
+
+    run: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RUN", help="the run folder")]
+    states: Annotated[int, tyro.conf.arg(help="fresh states of each ellipsoid [-] (>= 1)")] = 1000
+    seed: Annotated[int, tyro.conf.arg(help="of the states [-] (>= 0)")] = 0
+
+
+def read_optimize(arguments: Sequence[str], runs: Path) -> tuple[Config, Path]:
+    """The configuration with its overrides, and the run folder.
+
+    Raises `UserError` for a wrong YAML or value; tyro itself exits with code 2 for an unknown option.
+    """
+    if arguments and not arguments[0].startswith("-"):
+        source = Path(arguments[0])
+        defaults, folder = load(source), runs / source.stem
+    elif not arguments or {"-h", "--help"} & set(arguments):
+        defaults, folder = parse_yaml(EXAMPLE), runs / "NAME"
+    else:
+        raise UserError(f"the configuration comes first, but found {arguments[0]!r}: {OPTIMIZE_USAGE}")
+    options = _parse(arguments, OptimizeOptions(config=tyro.MISSING, settings=_config_branch(defaults), run=folder))
+    return parse(options.settings, f"{options.config} with the options given"), options.run
+
+
+def read_verify(arguments: Sequence[str]) -> VerifyOptions:
+    """The checked options of `rtcd verify`; `UserError` if one is out of range."""
+    options = tyro.cli(VerifyOptions, args=arguments, prog="rtcd verify", use_underscores=True)
+    if options.states < 1:
+        raise UserError(f"--states = {options.states}: must be >= 1")
+    if options.seed < 0:
+        raise UserError(f"--seed = {options.seed}: must be >= 0")
+    if not options.run.is_dir():
+        raise UserError(f"{options.run}: no such run folder; `{OPTIMIZE_USAGE}` makes one")
+    return options
+
+
+def _parse(arguments: Sequence[str], defaults: OptimizeOptions) -> OptimizeOptions:
+    registry = ConstructorRegistry()
+    registry.struct_rule(_plain)
+    return tyro.cli(
+        OptimizeOptions,
+        prog="rtcd optimize",
+        args=arguments,
+        default=defaults,
+        registry=registry,
+        use_underscores=True,
+    )
+
+
+def _plain(info: StructTypeInfo) -> StructConstructorSpec | None:
+    if isinstance(info.default, Branch):
+        return StructConstructorSpec(info.default.collect, info.default.fields)
+    return None
+
+
+def _config_branch(config: Config) -> Branch:
+    plant = config.plant
+    design = {name: _section(variable, plant.design[name]) for name, variable in config.design.items()}
+    weights = {"q": _list(config.weights.q, plant.states), "r": _list(config.weights.r, plant.inputs)}
+    task = _section(config.task, ", ".join(plant.states.values()))
+    return _section(config, branches={"task": task, "design": _group(design), "weights": _group(weights)})
+
+
+def _list(weights: Sequence[Variable], units: Mapping[str, str]) -> Branch:
+    pairs = zip(weights, units.values(), strict=True)
+    branches = {str(i): _section(weight, f"1/(s ({unit})^2)") for i, (weight, unit) in enumerate(pairs)}
+    return Branch(_group(branches).fields, lambda **values: tuple(values.values()))
+
+
+def _group(branches: Mapping[str, Branch]) -> Branch:
+    return Branch(tuple(StructFieldSpec(name, Branch, branch) for name, branch in branches.items()))
+
+
+def _section(settings: Settings, unit: str = "", branches: Mapping[str, Branch] | None = None) -> Branch:
+    """One option for each field, a branch for each section in it; `unit` replaces the placeholder in their help."""
+    ready = branches or {}
+    fields = []
+    for name, field in type(settings).model_fields.items():
+        value = getattr(settings, name)
+        if name in ready or isinstance(value, Settings):
+            fields.append(StructFieldSpec(name, Branch, ready.get(name) or _section(value, unit), field.description))
+        else:
+            fields.append(StructFieldSpec(name, field.annotation, value, _help(field, unit)))
+    return Branch(tuple(fields))
+
+
+def _help(field: FieldInfo, unit: str) -> str:
+    text = str(field.description).replace(UNIT, unit)
+    limits = bounds(field)
+    return f"{text} ({limits})" if limits else text
