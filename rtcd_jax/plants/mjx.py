@@ -22,7 +22,8 @@ import numpy as np
 from jaxtyping import Array, DTypeLike, Float
 from mujoco.batch import Batch
 
-from rtcd_jax.plants.base import Plant
+from rtcd_jax.numerics.integrate import rk4_step
+from rtcd_jax.plants.base import ModelEdits, Plant
 
 with contextlib.redirect_stdout(io.StringIO()):  # a missing warp announces itself on stdout
     from mujoco import mjx
@@ -66,52 +67,31 @@ def compile_model(plant: Plant, design: eqx.Module) -> mujoco.MjModel:
 class MjxStepper(eqx.Module):
     """The plant's motion by MJX, for one design and one state; vmap it over both.
 
-    Everything is computed in the dtype of the state; strict dtype and rank promotion are suspended inside.
+    States and results have the dtype of `x`; strict dtype and rank promotion are suspended inside.
 
     Raises:
         ValueError: as `compile_model`.
     """
 
     plant: Plant
-    model: mjx.Model
-    data: mjx.Data
 
-    def __init__(self, plant: Plant):
-        self.plant = plant
-        self.model, self.data = _template(type(plant), jnp.dtype(jnp.result_type(float)))
+    def __check_init__(self):
+        _template(type(self.plant), jnp.result_type(float))
+
+    def dynamics(self, design: eqx.Module, x: Float[Array, " n"], u: Float[Array, " m"]) -> Float[Array, " n"]:
+        """State derivative (qvel, qacc): MJX in the place of `Plant.dynamics`."""
+        template, at_rest = _template(type(self.plant), jnp.result_type(float))
+        qpos, qvel = jnp.split(x, 2)
+        with jax.numpy_rank_promotion("allow"), jax.numpy_dtype_promotion("standard"):  # MJX relies on both
+            model = _edited(_cast(template, x.dtype), self.plant.edit_model(design))
+            data = _cast(at_rest, x.dtype).replace(qpos=qpos, qvel=qvel, ctrl=u)
+            return jnp.concatenate([qvel, mjx.forward(model, data).qacc.astype(x.dtype)])
 
     def step(
         self, design: eqx.Module, x: Float[Array, " n"], u: Float[Array, " m"], dt: Float[Array, ""] | float
     ) -> Float[Array, " n"]:
-        """State (qpos, qvel) after one fourth-order Runge-Kutta step of `dt` [s], `u` held throughout."""
-        with _mjx_arithmetic(x.dtype):
-            model = self._edited_model(design, x.dtype)
-            model = model.tree_replace({"opt.timestep": jnp.asarray(dt, x.dtype)})
-            data = mjx.step(model, self._data_at(x, u))
-            return jnp.concatenate([data.qpos, data.qvel]).astype(x.dtype)
-
-    def dynamics(self, design: eqx.Module, x: Float[Array, " n"], u: Float[Array, " m"]) -> Float[Array, " n"]:
-        """State derivative (qvel, qacc): MJX in the place of `Plant.dynamics`."""
-        with _mjx_arithmetic(x.dtype):
-            data = mjx.forward(self._edited_model(design, x.dtype), self._data_at(x, u))
-            return jnp.concatenate([data.qvel, data.qacc]).astype(x.dtype)
-
-    def _edited_model(self, design: eqx.Module, dtype: DTypeLike) -> mjx.Model:
-        model = _cast(self.model, dtype)
-        leaves = {}
-        for attribute, edit in self.plant.edit_model(design).items():
-            leaf = operator.attrgetter(attribute)(model)
-            if isinstance(edit, Mapping):
-                for name, row in edit.items():
-                    leaf = leaf.at[_row(model, attribute, name)].set(row.astype(dtype))
-            else:
-                leaf = edit.astype(dtype)
-            leaves[attribute] = leaf
-        return model.tree_replace(leaves)
-
-    def _data_at(self, x: Float[Array, " n"], u: Float[Array, " m"]) -> mjx.Data:
-        qpos, qvel = jnp.split(x, 2)
-        return _cast(self.data, x.dtype).replace(qpos=qpos, qvel=qvel, ctrl=u.astype(x.dtype))
+        """State after one step of MuJoCo's RK4 integrator, of `dt` [s], `u` held throughout."""
+        return rk4_step(lambda x, u: self.dynamics(design, x, u), x, u, jnp.asarray(dt, x.dtype))
 
 
 class CpuDynamics:
@@ -150,7 +130,7 @@ def _template(robot: type[Plant], dtype: np.dtype) -> tuple[mjx.Model, mjx.Data]
     model.opt.disableflags |= _UNUSED
     # L'DL written out elementwise: a batched dense Cholesky calls LAPACK once a lane on the CPU.
     model.opt.jacobian = mujoco.mjtJacobian.mjJAC_SPARSE
-    with jax.ensure_compile_time_eval(), _mjx_arithmetic(dtype):
+    with jax.ensure_compile_time_eval():
         pair = mjx.put_model(model), mjx.make_data(model)
         return jax.tree.map(lambda leaf: _as_float(np.asarray(leaf), dtype), pair)
 
@@ -207,6 +187,19 @@ def _name(model: mujoco.MjModel, kind: mujoco.mjtObj, index: int) -> str:
     return mujoco.mj_id2name(model, kind, index) or f"number {index}"
 
 
+def _edited(model: mjx.Model, edits: ModelEdits) -> mjx.Model:
+    leaves = {}
+    for attribute, edit in edits.items():
+        leaf = operator.attrgetter(attribute)(model)
+        if isinstance(edit, Mapping):
+            for name, row in edit.items():
+                leaf = leaf.at[_row(model, attribute, name)].set(row.astype(leaf.dtype))
+        else:
+            leaf = edit.astype(leaf.dtype)
+        leaves[attribute] = leaf
+    return model.tree_replace(leaves)
+
+
 def _row(model: mujoco.MjModel | mjx.Model, attribute: str, name: str) -> int:
     """Index in `attribute` of the body, joint or geom called `name`."""
     kind = _OBJECTS[attribute.split("_")[0]]
@@ -222,14 +215,3 @@ def _as_float(leaf, dtype: DTypeLike):
 
 def _cast(tree, dtype: DTypeLike):
     return jax.tree.map(lambda leaf: _as_float(jnp.asarray(leaf), dtype), tree)
-
-
-@contextlib.contextmanager
-def _mjx_arithmetic(dtype: DTypeLike) -> Iterator[None]:
-    """MJX relies on promotions that strict callers forbid, and mixes float64 into float32 where JAX allows both."""
-    with (
-        jax.numpy_rank_promotion("allow"),
-        jax.numpy_dtype_promotion("standard"),
-        jax.enable_x64(jnp.dtype(dtype) == jnp.float64),
-    ):
-        yield

@@ -1,0 +1,196 @@
+"""MuJoCo, MJX and the closed form describe one robot."""
+# pyright: reportAttributeAccessIssue=false
+# (mujoco ships no types for its native module.)
+
+import subprocess
+import sys
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+
+from rtcd_jax.plants.mjx import CpuDynamics, MjxStepper, compile_model
+from rtcd_jax.plants.pendulum import Pendulum
+
+DT = 0.01
+BOUNDING_VOLUMES = {"geom_rbound", "geom_aabb", "bvh_aabb"}  # of the drawing alone; nothing here collides
+
+
+def _rk4(f, x, dt):
+    k1 = f(x)
+    k2 = f(x + dt / 2 * k1)
+    k3 = f(x + dt / 2 * k2)
+    k4 = f(x + dt * k3)
+    return x + dt / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
+
+
+def _c_step(model: mujoco.MjModel, x, u, dt: float) -> np.ndarray:
+    model.opt.timestep = dt
+    data = mujoco.MjData(model)
+    data.qpos, data.qvel = np.split(np.asarray(x), 2)
+    data.ctrl = np.asarray(u)
+    mujoco.mj_step(model, data)
+    return np.concatenate([data.qpos, data.qvel])
+
+
+def _arrays(model: mujoco.MjModel) -> dict[str, np.ndarray]:
+    names = (name for name in dir(model) if not name.startswith("_") and name not in BOUNDING_VOLUMES)
+    values = {name: getattr(model, name) for name in names}
+    values["opt.gravity"] = model.opt.gravity
+    return {k: v for k, v in values.items() if isinstance(v, np.ndarray) and np.issubdtype(v.dtype, np.number)}
+
+
+def test_edited_model_is_the_recompiled_one_in_every_array(robot):
+    edited = _arrays(compile_model(robot.plant, robot.design(1)))
+    recompiled = _arrays(robot.recompiled(1))
+    assert {"body_mass", "body_ipos", "dof_damping", "dof_invweight0", "geom_size"} <= edited.keys()
+    for name, array in edited.items():
+        np.testing.assert_allclose(array, recompiled[name], rtol=1e-12, atol=1e-15, err_msg=name)
+
+
+def test_c_accelerations_are_the_closed_forms(robot):
+    """1e-8 of them: the bodies' own inertia, which MuJoCo wants positive for a point mass, is far below that."""
+    for index in range(3):
+        design = robot.design(index)
+        expected = jax.vmap(lambda x, u, design=design: robot.plant.dynamics(design, x, u))(robot.x, robot.u)
+        found = CpuDynamics(robot.recompiled(index), len(robot.x))(np.asarray(robot.x), np.asarray(robot.u))
+        np.testing.assert_allclose(found, expected, rtol=1e-8, atol=1e-8)
+
+
+def test_c_accelerations_of_fewer_states_than_the_capacity(robot):
+    x, u = np.asarray(robot.x), np.asarray(robot.u)
+    dynamics = CpuDynamics(robot.recompiled(0), len(x))
+    everything = dynamics(x, u)
+    np.testing.assert_array_equal(dynamics(x[:5], u[:5]), everything[:5])
+    np.testing.assert_array_equal(dynamics(x[5:], u[5:]), everything[5:])
+
+
+def test_mjx_step_is_the_closed_forms_runge_kutta_step(robot, mjx_step):
+    """Step by step along 100 steps; the tolerance is the bodies' own inertia, as above."""
+    closed_form = jax.jit(
+        jax.vmap(lambda design, x, u: _rk4(lambda y: robot.plant.dynamics(design, y, u), x, DT), in_axes=(0, 0, 0))
+    )
+    x = robot.x
+    for _ in range(100):
+        ours, theirs = closed_form(robot.designs, x, robot.u), mjx_step(robot.designs, x, robot.u, DT)
+        np.testing.assert_allclose(theirs, ours, rtol=1e-9, atol=1e-9)
+        x = ours
+
+
+def test_mjx_step_of_batched_designs_is_c_mujocos_on_recompiled_models(robot, mjx_step):
+    """Same formulas in another order of summation: some ten roundings of values of about 100."""
+    found = mjx_step(robot.designs, robot.x, robot.u, DT)
+    for index in range(len(robot.x)):
+        expected = _c_step(robot.recompiled(index), robot.x[index], robot.u[index], DT)
+        np.testing.assert_allclose(found[index], expected, rtol=1e-12, atol=1e-12)
+
+
+def test_mjx_step_takes_a_traced_time_step(robot, mjx_step):
+    for dt in (0.001, 0.02):
+        expected = _c_step(robot.recompiled(0), robot.x[0], robot.u[0], dt)
+        found = mjx_step(robot.designs, robot.x, robot.u, dt)
+        np.testing.assert_allclose(found[0], expected, rtol=1e-12, atol=1e-12)
+
+
+def test_mjx_step_of_a_batch_is_the_loop_of_steps(robot, mjx_step):
+    step = jax.jit(MjxStepper(robot.plant).step)
+    batched = mjx_step(robot.designs, robot.x, robot.u, DT)
+    for index in range(3):
+        single = step(robot.design(index), robot.x[index], robot.u[index], DT)
+        np.testing.assert_allclose(batched[index], single, rtol=1e-14, atol=1e-14)
+
+
+@pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
+def test_mjx_scans_under_strict_promotion_in_the_states_dtype(robot, dtype):
+    stepper = MjxStepper(robot.plant)
+    designs, x0, us = jax.tree.map(lambda leaf: leaf.astype(dtype), (robot.designs, robot.x, robot.u))
+
+    def last_state(design, x, u):
+        return jax.lax.scan(lambda x, _: (stepper.step(design, x, u, DT), None), x, length=10)[0]
+
+    with jax.numpy_rank_promotion("raise"), jax.numpy_dtype_promotion("strict"):
+        found = jax.jit(jax.vmap(last_state))(designs, x0, us)
+        slopes = jax.jit(jax.vmap(stepper.dynamics))(designs, x0, us)
+    assert found.dtype == slopes.dtype == dtype
+    tolerance = {jnp.float32: 1e-4, jnp.float64: 1e-9}[dtype]
+    closed_form = jax.vmap(robot.plant.dynamics)(robot.designs, robot.x, robot.u)
+    np.testing.assert_allclose(slopes, closed_form, rtol=tolerance, atol=tolerance)
+    reference = robot.x
+    for _ in range(10):
+        reference = jax.vmap(
+            lambda design, x, u: _rk4(lambda y: robot.plant.dynamics(design, y, u), x, DT), in_axes=(0, 0, 0)
+        )(robot.designs, reference, robot.u)
+    np.testing.assert_allclose(found, reference, rtol=tolerance, atol=tolerance)
+
+
+def test_the_template_belongs_to_no_trace(robot):
+    """A stepper made for the first time inside jit must not leak tracers into the next one."""
+
+    class Fresh(type(robot.plant)):
+        pass
+
+    plant = Fresh(*jax.tree.leaves(robot.plant))
+    arguments = robot.design(0), robot.x[0], robot.u[0]
+    inside = jax.jit(lambda *a: MjxStepper(plant).dynamics(*a))(*arguments)
+    np.testing.assert_allclose(inside, MjxStepper(plant).dynamics(*arguments), rtol=1e-14)
+
+
+SLIDER = '<body><joint type="slide"/><inertial pos="0 0 0" mass="1" diaginertia="1 1 1"/></body></worldbody>'
+MOTOR = '<motor name="torque" joint="theta" gear="1"/>'
+HINGE = 'type="hinge" axis="0 -1 0"'
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ('contype="0"', 'contype="1"', r"contacts are on .*: geom motor, hub, rod, bob$"),
+        (
+            "</mujoco>",
+            '<contact><pair name="touch" geom1="motor" geom2="bob"/></contact></mujoco>',
+            r"pairs: pair touch",
+        ),
+        (HINGE, f'{HINGE} limited="true" range="-1 1"', r"joint limits are on .*: joint theta$"),
+        (HINGE, f'{HINGE} frictionloss="0.1"', r"friction loss, which is not smooth: joint theta$"),
+        (HINGE, f'{HINGE} actuatorfrclimited="true" actuatorfrcrange="-1 1"', r"force limits are on .*: joint theta$"),
+        (HINGE, 'type="ball"', r"joint theta: quaternions"),
+        ('gear="1"', 'ctrllimited="true" ctrlrange="-1 1"', r"control limits are on .*: actuator torque$"),
+        ('gear="1"', 'forcelimited="true" forcerange="-1 1"', r"force limits are on .*: actuator torque$"),
+        (
+            "</mujoco>",
+            '<equality><joint joint1="theta"/></equality></mujoco>',
+            r"equality constraints: equality number 0$",
+        ),
+        ('integrator="RK4"', 'integrator="Euler"', r'integrator must be <option integrator="RK4"/>$'),
+        ("</worldbody>", SLIDER, r"2 positions and 2 velocities, the plant 2 states$"),
+        ("</actuator>", '<motor joint="theta"/></actuator>', r"2 actuators, the plant 1 inputs$"),
+        (MOTOR, '<general joint="theta" dyntype="integrator"/>', r"1 actuator states"),
+        (
+            'body name="bob"',
+            'body name="ball"',
+            r"is edited at 'bob', but the model has no body of that name$",
+        ),
+    ],
+)
+def test_models_that_an_edit_cannot_represent_are_refused_by_name(tmp_path, old, new, message):
+    text = Pendulum.mjcf.read_text()
+    assert text.count(old) == 1
+    path = tmp_path / "robot.xml"
+    path.write_text(text.replace(old, new))
+
+    class Robot(Pendulum):
+        mjcf = path
+
+    design = Robot.Design(jnp.asarray(0.7), jnp.asarray(0.4))
+    with pytest.raises(ValueError, match=message):
+        compile_model(Robot(), design)
+    with pytest.raises(ValueError, match=message):
+        MjxStepper(Robot()).dynamics(design, jnp.zeros(2), jnp.zeros(1))
+
+
+def test_importing_mjx_says_nothing():
+    done = subprocess.run(
+        [sys.executable, "-c", "import rtcd_jax.plants.mjx"], capture_output=True, text=True, check=True
+    )
+    assert done.stdout + done.stderr == ""
