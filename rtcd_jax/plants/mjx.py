@@ -13,6 +13,7 @@ import functools
 import io
 import operator
 from collections.abc import Iterator, Mapping
+from typing import cast
 
 import equinox as eqx
 import jax
@@ -23,6 +24,7 @@ from jaxtyping import Array, DTypeLike, Float
 from mujoco.batch import Batch
 
 from rtcd_jax.numerics.integrate import rk4_step
+from rtcd_jax.plants import plant_class
 from rtcd_jax.plants.base import ModelEdits, Plant
 
 with contextlib.redirect_stdout(io.StringIO()):  # a missing warp announces itself on stdout
@@ -64,6 +66,17 @@ def compile_model(plant: Plant, design: eqx.Module) -> mujoco.MjModel:
     return model
 
 
+def model_of(name: str, parameters: Mapping[str, float]) -> mujoco.MjModel:
+    """The MuJoCo model of the plant called `name` with these physical numbers, whatever JAX's precision is.
+
+    Raises:
+        ValueError: no plant has this name.
+        KeyError: a parameter is missing.
+    """
+    with jax.enable_x64(True):
+        return compile_model(*plant_class(name).from_parameters(parameters))
+
+
 class MjxStepper(eqx.Module):
     """The plant's motion by MJX, for one design and one state; vmap it over both.
 
@@ -82,7 +95,7 @@ class MjxStepper(eqx.Module):
         """State derivative (qvel, qacc): MJX in the place of `Plant.dynamics`."""
         template, at_rest = _template(type(self.plant), jnp.result_type(float))
         qpos, qvel = jnp.split(x, 2)
-        with jax.numpy_rank_promotion("allow"), jax.numpy_dtype_promotion("standard"):  # MJX relies on both
+        with _promotion():
             model = _edited(_cast(template, x.dtype), self.plant.edit_model(design))
             data = _cast(at_rest, x.dtype).replace(qpos=qpos, qvel=qvel, ctrl=u)
             return jnp.concatenate([qvel, mjx.forward(model, data).qacc.astype(x.dtype)])
@@ -130,8 +143,8 @@ def _template(robot: type[Plant], dtype: np.dtype) -> tuple[mjx.Model, mjx.Data]
     model.opt.disableflags |= _UNUSED
     # L'DL written out elementwise: a batched dense Cholesky calls LAPACK once a lane on the CPU.
     model.opt.jacobian = mujoco.mjtJacobian.mjJAC_SPARSE
-    with jax.ensure_compile_time_eval():
-        pair = mjx.put_model(model), mjx.make_data(model)
+    with jax.ensure_compile_time_eval(), _promotion():
+        pair = mjx.put_model(model, impl="jax"), mjx.make_data(model, impl="jax")
         return jax.tree.map(lambda leaf: _as_float(np.asarray(leaf), dtype), pair)
 
 
@@ -197,7 +210,7 @@ def _edited(model: mjx.Model, edits: ModelEdits) -> mjx.Model:
         else:
             leaf = edit.astype(leaf.dtype)
         leaves[attribute] = leaf
-    return model.tree_replace(leaves)
+    return cast(mjx.Model, model.tree_replace(leaves))
 
 
 def _row(model: mujoco.MjModel | mjx.Model, attribute: str, name: str) -> int:
@@ -215,3 +228,10 @@ def _as_float(leaf, dtype: DTypeLike):
 
 def _cast(tree, dtype: DTypeLike):
     return jax.tree.map(lambda leaf: _as_float(jnp.asarray(leaf), dtype), tree)
+
+
+@contextlib.contextmanager
+def _promotion() -> Iterator[None]:
+    """Inside, ranks and dtypes promote as MJX expects, also for callers who forbid it."""
+    with jax.numpy_rank_promotion("allow"), jax.numpy_dtype_promotion("standard"):
+        yield

@@ -11,8 +11,9 @@ import mujoco
 import numpy as np
 import pytest
 
+from rtcd_jax.plants.base import Plant
 from rtcd_jax.plants.mjx import CpuDynamics, MjxStepper, compile_model
-from rtcd_jax.plants.pendulum import Pendulum
+from rtcd_jax.plants.pendulum import Pendulum, PendulumDesign
 
 DT = 0.01
 BOUNDING_VOLUMES = {"geom_rbound", "geom_aabb", "bvh_aabb"}  # of the drawing alone; nothing here collides
@@ -128,12 +129,11 @@ def test_mjx_scans_under_strict_promotion_in_the_states_dtype(robot, dtype):
 def test_the_template_belongs_to_no_trace(robot):
     """A stepper made for the first time inside jit must not leak tracers into the next one."""
 
-    class Fresh(type(robot.plant)):
-        pass
-
-    plant = Fresh(*jax.tree.leaves(robot.plant))
+    fresh: type[Plant] = type("Fresh", (type(robot.plant),), {})
+    plant = fresh(*jax.tree.leaves(robot.plant))
     arguments = robot.design(0), robot.x[0], robot.u[0]
-    inside = jax.jit(lambda *a: MjxStepper(plant).dynamics(*a))(*arguments)
+    with jax.numpy_rank_promotion("raise"), jax.numpy_dtype_promotion("strict"):
+        inside = jax.jit(lambda *a: MjxStepper(plant).dynamics(*a))(*arguments)
     np.testing.assert_allclose(inside, MjxStepper(plant).dynamics(*arguments), rtol=1e-14)
 
 
@@ -178,15 +178,12 @@ def test_models_that_an_edit_cannot_represent_are_refused_by_name(tmp_path, old,
     assert text.count(old) == 1
     path = tmp_path / "robot.xml"
     path.write_text(text.replace(old, new))
-
-    class Robot(Pendulum):
-        mjcf = path
-
-    design = Robot.Design(jnp.asarray(0.7), jnp.asarray(0.4))
+    robot = type("Robot", (Pendulum,), {"mjcf": path})
+    design = PendulumDesign(jnp.asarray(0.7), jnp.asarray(0.4))
     with pytest.raises(ValueError, match=message):
-        compile_model(Robot(), design)
+        compile_model(robot(), design)
     with pytest.raises(ValueError, match=message):
-        MjxStepper(Robot()).dynamics(design, jnp.zeros(2), jnp.zeros(1))
+        MjxStepper(robot()).dynamics(design, jnp.zeros(2), jnp.zeros(1))
 
 
 def test_importing_mjx_says_nothing():
