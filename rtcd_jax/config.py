@@ -345,9 +345,9 @@ class _Loader(yaml.SafeLoader):
     def construct_mapping(self, node, deep=False):
         seen = set()
         for key, _ in node.value:
-            if key.value in seen:
+            if isinstance(key, yaml.ScalarNode) and key.value in seen:
                 raise yaml.MarkedYAMLError(problem=f"the key {key.value!r} is given twice", problem_mark=key.start_mark)
-            seen.add(key.value)
+            seen.add(str(key.value))
         return super().construct_mapping(node, deep)
 
 
@@ -355,7 +355,7 @@ _EXPONENT_WITHOUT_DOT = re.compile(r"[-+]?\d+[eE][-+]?\d+$")
 _Loader.add_implicit_resolver("tag:yaml.org,2002:float", _EXPONENT_WITHOUT_DOT, list("-+0123456789"))
 
 
-def parse_yaml(text: str, source: str = "configuration") -> Config:
+def parse_yaml(text: str | bytes, source: str = "configuration") -> Config:
     """The configuration that a YAML text describes; `ConfigError` if it is no YAML or no valid configuration."""
     try:
         data = yaml.load(text, _Loader)
@@ -374,7 +374,7 @@ def load(path: Path) -> Config:
         there = sorted(str(other) for other in path.parent.glob("*.y*ml"))
         advice = closest(path, there) if there else f"{path.parent} has no YAML file"
         raise ConfigError([Problem((), f"no such file; {advice}")], str(path))
-    return parse_yaml(path.read_text(encoding="utf-8"), str(path))
+    return parse_yaml(path.read_bytes(), str(path))
 
 
 def resolved(config: Config) -> dict[str, Any]:

@@ -45,10 +45,10 @@ class Progress:
 
 
 class Console:
-    """Where a run speaks. A context manager: leaving it frees the terminal's line."""
+    """Where a run speaks: stdout, a stream or a rich terminal. A context manager: leaving it ends the live line."""
 
-    def __init__(self, stream: TextIO | None = None):
-        self._terminal = Terminal(file=stream or sys.stdout, highlight=False, markup=False, emoji=False)
+    def __init__(self, stream: TextIO | None = None, terminal: Terminal | None = None):
+        self._terminal = terminal or Terminal(file=stream or sys.stdout)
         self._bar: Bar | None = None
 
     def __enter__(self) -> Self:
@@ -61,7 +61,7 @@ class Console:
 
     def message(self, text: str) -> None:
         """A line that stays; on a terminal above the live one."""
-        self._terminal.print(text, soft_wrap=True)
+        self._terminal.print(text, soft_wrap=True, highlight=False, markup=False, emoji=False)
         self._terminal.file.flush()
 
     def progress(self, now: Progress) -> None:
