@@ -1,0 +1,72 @@
+"""Files that are replaced as a whole, and whose errors name them."""
+
+import contextlib
+import json
+import math
+import os
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from rtcd_jax.errors import UserError
+
+
+def plain(value: Any) -> Any:
+    """`value` in JSON's own types, arrays as lists; None where a number is not finite."""
+    if isinstance(value, Mapping):
+        return {str(key): plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [plain(item) for item in value]
+    if hasattr(value, "tolist"):
+        return plain(np.asarray(value).tolist())
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    if value is None or isinstance(value, str | int):
+        return value
+    raise TypeError(f"JSON has no {type(value).__name__}: {value!r}")
+
+
+def replace_json(path: Path, record: Mapping[str, Any]) -> None:
+    """`replace` by JSON that a human can read, with null for what is not finite."""
+    text = json.dumps(plain(record), indent=2, allow_nan=False, ensure_ascii=False)
+    replace(path, f"{text}\n".encode())
+
+
+def replace(path: Path, content: bytes) -> None:
+    """The old file or the new one, never a part, whenever the process or the machine stops."""
+    temporary = path.with_name(f".{path.name}.tmp")
+    with writing(path):
+        with temporary.open("wb") as file:
+            file.write(content)
+            file.flush()
+            os.fsync(file.fileno())
+        temporary.replace(path)
+    sync(path.parent)
+
+
+def sync(path: Path) -> None:
+    """Waits until a file, or a folder's list of files, is on disk."""
+    with writing(path):
+        descriptor = os.open(path, os.O_RDONLY)
+        try:
+            os.fsync(descriptor)
+        finally:
+            os.close(descriptor)
+
+
+@contextlib.contextmanager
+def writing(path: Path, kinds: tuple[type[Exception], ...] = (OSError,)) -> Iterator[None]:
+    """Turns the system's errors into one that names the path and can be shown as it is."""
+    try:
+        yield
+    except UserError:
+        raise
+    except kinds as error:
+        raise UserError(f"cannot write {path}: {getattr(error, 'strerror', None) or error}") from error
+
+
+def is_temporary(path: Path) -> bool:
+    """True for what `replace` leaves behind if it is killed."""
+    return path.name.startswith(".") and path.suffix == ".tmp"

@@ -1,0 +1,306 @@
+"""The run folder: what a run leaves behind, and all that it needs to go on after a kill at any moment.
+
+    format.json                the mark of a run folder and its format's version
+    config.yaml                the resolved configuration
+    provenance.json            versions, device and commit of every start of the run
+    generations.jsonl          one line a generation, flushed at once
+    state/                     checkpoints of the search, the latest two
+    initial.npz, initial.json  the configuration's initial candidate
+    elites/NNN.npz, NNN.json   the best candidates, 000 first
+
+Every file but the JSON lines is replaced as a whole; the lines are cut back to the checkpoint at a resume. Numbers that
+are not finite are stored as null. Reading needs neither JAX nor orbax, which are imported where states are kept.
+"""
+
+import contextlib
+import fcntl
+import io
+import itertools
+import json
+import os
+import socket
+import time
+from collections.abc import Iterable, Iterator, Mapping
+from pathlib import Path
+from typing import Any, Self, TypeVar, final
+
+import numpy as np
+
+from rtcd_jax import config as configuration
+from rtcd_jax.config import Config
+from rtcd_jax.errors import UserError
+from rtcd_jax.files import is_temporary, plain, replace, replace_json, sync, writing
+from rtcd_jax.provenance import provenance
+
+FORMAT = "rtcd_jax run"
+VERSION = 1
+KEPT_STATES = 2
+_LOCK = ".lock"
+
+State = TypeVar("State")
+Arrays = Mapping[str, np.ndarray]
+Record = Mapping[str, Any]
+
+
+@final
+class RunFolder:
+    """A run folder that this process alone may write. A context manager: leaving it frees the folder.
+
+    Every method raises UserError, naming the path, where the folder cannot be written.
+    """
+
+    def __init__(self, path: Path, seconds: float, checkpointer: Any, held: contextlib.ExitStack):
+        self.path = path
+        self._seconds = seconds
+        self._checkpointer = checkpointer
+        self._held = held
+        self._saved = time.monotonic()
+
+    @classmethod
+    def open(cls, path: Path, config: Config) -> Self:
+        """The folder of a new run, or of the one that `config` began: then `restore` gives the state to go on from.
+
+        Raises UserError if the folder holds something else, a run of another configuration (every differing key with
+        both values) or of another format, or if another process works on it.
+        """
+        _require_run_or_nothing(path)
+        with contextlib.ExitStack() as stack:
+            with writing(path):
+                path.mkdir(parents=True, exist_ok=True)
+            stack.enter_context(_locked(path))
+            with writing(path):
+                for leftover in path.rglob(".*.tmp"):
+                    leftover.unlink()
+            _claim(path, config)
+            _add_start(path, config)
+            with writing(path):
+                (path / "generations.jsonl").touch()
+            checkpointer = stack.enter_context(_checkpoints(path / "state"))
+            return cls(path, config.checkpoint.seconds, checkpointer, stack.pop_all())
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Frees the folder for other processes."""
+        self._held.close()
+
+    @property
+    def _state_path(self) -> Path:
+        return self.path / "state"
+
+    @property
+    def _lines_path(self) -> Path:
+        return self.path / "generations.jsonl"
+
+    def restore(self, state: State) -> State:
+        """The latest saved state, or `state` if there is none; later lines of generations.jsonl are cut off.
+
+        `state` is that of a search that has not begun: its arrays say the shapes. Raises UserError if the saved one
+        has others, or if lines are missing.
+        """
+        latest = self._checkpointer.latest
+        self._cut(latest.step if latest else 0)
+        return _load(self._checkpointer, state) if latest else state
+
+    def append(self, record: Record) -> None:
+        """Adds a generation to generations.jsonl."""
+        line = json.dumps(plain(record), allow_nan=False) + "\n"
+        with writing(self._lines_path), self._lines_path.open("ab") as file:
+            file.write(line.encode())
+
+    def save_if_due(self, state: Any, generation: int) -> bool:
+        """Saves if `checkpoint.seconds` have passed since the last save; says whether it did."""
+        due = time.monotonic() - self._saved >= self._seconds
+        if due:
+            self.save(state, generation)
+        return due
+
+    def save(self, state: Any, generation: int) -> None:
+        """Keeps the state after `generation` generations, all of them appended before; waits until it is on disk."""
+        sync(self._lines_path)
+        latest = self._checkpointer.latest
+        if latest is None or latest.step != generation:
+            # tensorstore tells of a full disk by ValueError.
+            with writing(self._state_path, (OSError, ValueError)):
+                self._checkpointer.save(generation, state, force=True)
+        self._saved = time.monotonic()
+
+    def write_initial(self, arrays: Arrays, record: Record) -> None:
+        """The configuration's initial candidate, in the elites' format."""
+        write_elite(self.path, "initial", arrays, record)
+
+    def write_elites(self, elites: Iterable[tuple[Arrays, Record]]) -> None:
+        """All elites, best first; those that were stored beyond their number are removed."""
+        folder = self.path / "elites"
+        with writing(folder):
+            folder.mkdir(exist_ok=True)
+        written = set()
+        for index, (arrays, record) in enumerate(elites):
+            written.add(f"{index:03d}")
+            write_elite(folder, f"{index:03d}", arrays, record)
+        with writing(folder):
+            for name in set(elite_names(self.path)) - written:
+                (folder / f"{name}.json").unlink()
+                (folder / f"{name}.npz").unlink(missing_ok=True)
+
+    def _cut(self, generations: int) -> None:
+        with self._lines_path.open("rb") as file:
+            complete = [len(line) for line in itertools.islice(file, generations) if line.endswith(b"\n")]
+        if len(complete) < generations:
+            raise UserError(
+                f"{self._lines_path} has {len(complete)} complete lines, but {self._state_path} is of generation "
+                f"{generations}: the folder was changed by hand; choose another one"
+            )
+        with writing(self._lines_path):
+            os.truncate(self._lines_path, sum(complete))
+
+
+def write_elite(folder: Path, name: str, arrays: Arrays, record: Record) -> None:
+    """Writes NAME.npz, then NAME.json; equal contents give equal bytes.
+
+    Raises TypeError for an array or a value that other programs could not read.
+    """
+    for key, array in arrays.items():
+        if not isinstance(array, np.ndarray) or array.dtype.kind not in "fiub":
+            raise TypeError(f"{name}.npz: {key} must be a numpy array of numbers, got {type(array).__name__}")
+    file = io.BytesIO()
+    np.savez(file, **arrays)  # type: ignore[arg-type]
+    replace(folder / f"{name}.npz", file.getvalue())
+    replace_json(folder / f"{name}.json", record)
+
+
+def read_elite(folder: Path, name: str) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+    """The arrays and the record of `folder`/NAME. Raises UserError, with the names that are there, if it is not."""
+    paths = [folder / f"{name}.{suffix}" for suffix in ("npz", "json")]
+    if not all(path.is_file() for path in paths):
+        there = ", ".join(sorted(path.stem for path in folder.glob("*.npz"))) or "nothing"
+        raise UserError(f"{folder} has no {name}.npz with its {name}.json; there is {there}")
+    with np.load(paths[0], allow_pickle=False) as file:
+        arrays = dict(file)
+    return arrays, json.loads(paths[1].read_text(encoding="utf-8"))
+
+
+def elite_names(path: Path) -> list[str]:
+    """Names of the elites in a run folder, best first."""
+    return sorted((file.stem for file in (path / "elites").glob("*.json") if file.stem.isdecimal()), key=int)
+
+
+def read_config(path: Path) -> Config:
+    """The configuration of a run. Raises UserError if the folder is no run folder that this version reads."""
+    if not (path / "format.json").is_file():
+        raise UserError(f"{path} is no run folder: it has no format.json")
+    _require_format(path)
+    return _stored_config(path)
+
+
+def read_generations(path: Path) -> list[dict[str, Any]]:
+    """The generations of a run, null for what was not finite; a torn last line is left out."""
+    with (path / "generations.jsonl").open("rb") as file:
+        return [json.loads(line) for line in file if line.endswith(b"\n")]
+
+
+def _require_run_or_nothing(path: Path) -> None:
+    if path.exists() and not path.is_dir():
+        raise UserError(f"{path} is a file: a run needs a folder")
+    if not path.exists() or (path / "format.json").is_file():
+        return
+    foreign = sorted(item.name for item in path.iterdir() if item.name != _LOCK and not is_temporary(item))
+    if foreign:
+        raise UserError(f"{path} is no run folder and not empty: it has {', '.join(foreign[:5])}; choose another one")
+
+
+def _claim(path: Path, config: Config) -> None:
+    """Writes format.json and config.yaml, or checks those that are there. format.json first: it marks the folder."""
+    if not (path / "format.json").is_file():
+        replace_json(path / "format.json", {"format": FORMAT, "version": VERSION})
+    _require_format(path)
+    if not (path / "config.yaml").is_file():
+        replace(path / "config.yaml", configuration.dump(config).encode())
+    changed = configuration.differences(_stored_config(path), config)
+    if changed:
+        keys = [f"  {key}: {old!r} in the folder, {new!r} now" for key, (old, new) in changed.items()]
+        head = f"{path} holds a run with another configuration; choose another folder, or set back"
+        raise UserError("\n".join([head, *keys]))
+
+
+def _require_format(path: Path) -> None:
+    file = path / "format.json"
+    try:
+        mark = json.loads(file.read_text(encoding="utf-8"))
+        name, version = mark["format"], mark["version"]
+    except (ValueError, KeyError, TypeError) as error:
+        raise UserError(f"{file} is not readable: {error!r}; choose another folder") from error
+    if (name, version) != (FORMAT, VERSION):
+        raise UserError(
+            f"{file} says {name!r}, version {version!r}, but this rtcd_jax reads {FORMAT!r}, version {VERSION}: "
+            "go on with the version in provenance.json, or choose another folder"
+        )
+
+
+def _stored_config(path: Path) -> Config:
+    file = path / "config.yaml"
+    return configuration.parse_yaml(file.read_text(encoding="utf-8"), str(file))
+
+
+def _add_start(path: Path, config: Config) -> None:
+    file = path / "provenance.json"
+    starts = json.loads(file.read_text(encoding="utf-8"))["starts"] if file.is_file() else []
+    replace_json(file, {"config_hash": configuration.config_hash(config), "starts": [*starts, provenance()]})
+
+
+@contextlib.contextmanager
+def _locked(path: Path) -> Iterator[None]:
+    """Holds the folder for this process; the system frees it when the process ends, however it ends."""
+    with contextlib.ExitStack() as stack:
+        with writing(path):
+            file = stack.enter_context((path / _LOCK).open("a+"))
+            try:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                file.seek(0)
+                holder = file.read().strip() or "another process"
+                raise UserError(f"{path} is in use by {holder}: wait for it or choose another folder") from None
+            file.truncate(0)
+            file.write(f"process {os.getpid()} on {socket.gethostname()}\n")
+            file.flush()
+        yield
+
+
+@contextlib.contextmanager
+def _checkpoints(path: Path) -> Iterator[Any]:
+    """Orbax's checkpointer; closing it waits for its threads, and tells again of a save that failed."""
+    from orbax.checkpoint import v1 as ocp
+
+    kinds = (OSError, ValueError)
+    with writing(path, kinds):
+        checkpointer = ocp.training.Checkpointer(
+            path.absolute(),
+            preservation_policy=ocp.training.preservation_policies.LatestN(KEPT_STATES),
+            cleanup_tmp_directories=True,
+        )
+    try:
+        yield checkpointer
+    finally:
+        with writing(path, kinds):
+            checkpointer.close()
+
+
+def _load(checkpointer: Any, state: State) -> State:
+    import jax
+    import jax.numpy as jnp
+
+    shapes = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=x.sharding), state)
+    latest = checkpointer.latest
+    try:
+        loaded = checkpointer.load(latest.step, shapes)
+    except (KeyError, ValueError, OSError) as error:
+        raise UserError(
+            f"{latest.path} is not a state of this search: another version or precision wrote it; go on with what "
+            "provenance.json names, or choose another folder"
+        ) from error
+    # A loaded array is bound to its device; a fresh one moves to where the evaluations are.
+    return jax.tree.map(lambda x: jnp.asarray(np.asarray(x)), loaded)
