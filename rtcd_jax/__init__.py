@@ -6,4 +6,35 @@ The data flow, one module a step; every step is written for one candidate and ma
               population   trajectory    policy    funnel    volume
 
 `evaluation` chains the steps, `search` asks CMA-ES for genomes and keeps the elites, `rtcd` is the command line.
+The names below are imported at their first use, so that `import rtcd_jax` alone stays light.
 """
+
+from importlib import import_module
+from typing import Any
+
+_HOMES = {
+    "Config": "config",
+    "load": "config",
+    "parse_yaml": "config",
+    "ConfigError": "errors",
+    "UserError": "errors",
+    "Candidate": "types",
+    "Trajectory": "types",
+    "Policy": "types",
+    "Funnel": "types",
+    "Volumes": "types",
+    "Evaluation": "types",
+    "Status": "types",
+}
+
+__all__ = list(_HOMES)  # pyright: ignore[reportUnsupportedDunderAll]
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOMES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(import_module(f"{__name__}.{_HOMES[name]}"), name)
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *_HOMES})

@@ -17,9 +17,9 @@ from pydantic import (
     Field,
     PlainValidator,
     SerializeAsAny,
-    TypeAdapter,
     ValidationError,
     ValidationInfo,
+    create_model,
     field_validator,
 )
 
@@ -56,10 +56,10 @@ class PendulumConfig(PlantConfig):
     inputs: ClassVar = {"torque": "N m"}
     design: ClassVar = {"mass": "kg", "length": "m"}
 
-    name: Literal["pendulum"] = Field("pendulum", description="torque-limited pendulum (paper, section III)")
-    damping: float = Field(0.1, ge=0, description="viscous friction at the pivot [N m s/rad]")
-    gravity: float = Field(9.81, gt=0, description="gravitational acceleration [m/s^2]")
-    torque_limit: float = Field(2.5, gt=0, description="largest |torque| of the motor [N m]")
+    name: Literal["pendulum"] = Field(default="pendulum", description="torque-limited pendulum (paper, section III)")
+    damping: float = Field(default=0.1, ge=0, description="viscous friction at the pivot [N m s/rad]")
+    gravity: float = Field(default=9.81, gt=0, description="gravitational acceleration [m/s^2]")
+    torque_limit: float = Field(default=2.5, gt=0, description="largest |torque| of the motor [N m]")
 
 
 PLANTS: dict[str, type[PlantConfig]] = {"pendulum": PendulumConfig}
@@ -82,7 +82,7 @@ class Variable(Settings):
     initial: float = Field(description=f"value of the initial candidate [{UNIT}]")
     min: float = Field(description=f"lower end of the box [{UNIT}]")
     max: float = Field(description=f"upper end of the box [{UNIT}]")
-    pinned: bool = Field(False, description="hold the initial value instead of searching")
+    pinned: bool = Field(default=False, description="hold the initial value instead of searching")
 
     @property
     def free(self) -> bool:
@@ -116,8 +116,8 @@ class WeightsConfig(Settings):
 
 
 class StepConfig(Settings):
-    min: float = Field(0.01, gt=0, description="shortest interval [s] (paper, section III)")
-    max: float = Field(0.1, gt=0, description="longest interval [s] (paper, section III)")
+    min: float = Field(default=0.01, gt=0, description="shortest interval [s] (paper, section III)")
+    max: float = Field(default=0.1, gt=0, description="longest interval [s] (paper, section III)")
 
     def problems(self) -> Iterator[Problem]:
         if self.min >= self.max:
@@ -125,21 +125,25 @@ class StepConfig(Settings):
 
 
 class TrajectoryConfig(Settings):
-    knots: int = Field(51, ge=3, description="knots N+1 of the nominal motion [-] (paper, section III)")
-    step: StepConfig = Field(StepConfig(), description="box of the one free step that all intervals share [s]")
-    time_weight: float = Field(0.1, ge=0, description="w_t, the cost of duration [1/s] (paper, section III)")
-    substeps: int = Field(5, ge=1, description="RK4 steps of dynamics and Riccati equation inside an interval [-]")
-    max_iterations: int = Field(200, ge=1, description="iterations of the trajectory optimizer [-]")
+    knots: int = Field(default=51, ge=3, description="knots N+1 of the nominal motion [-] (paper, section III)")
+    step: StepConfig = Field(default=StepConfig(), description="box of the one free step that all intervals share [s]")
+    time_weight: float = Field(default=0.1, ge=0, description="w_t, the cost of duration [1/s] (paper, section III)")
+    substeps: int = Field(
+        default=5, ge=1, description="RK4 steps of dynamics and Riccati equation inside an interval [-]"
+    )
+    max_iterations: int = Field(default=200, ge=1, description="iterations of the trajectory optimizer [-]")
 
 
 class GoalConfig(Settings):
     """The region of attraction of the goal's LQR, from which the last level follows."""
 
-    directions: int = Field(64, ge=1, description="quasi-random directions about the goal [-]")
-    radii: int = Field(8, ge=2, description="radii along each direction [-]")
-    rounds: int = Field(3, ge=1, description="refinements of the level, each between its neighbouring radii [-]")
-    horizon: float = Field(8.0, gt=0, description="time within which a rollout must arrive [s]")
-    step: float = Field(0.02, gt=0, description="RK4 step of these rollouts [s]")
+    directions: int = Field(default=64, ge=1, description="quasi-random directions about the goal [-]")
+    radii: int = Field(default=8, ge=2, description="radii along each direction [-]")
+    rounds: int = Field(
+        default=3, ge=1, description="refinements of the level, each between its neighbouring radii [-]"
+    )
+    horizon: float = Field(default=8.0, gt=0, description="time within which a rollout must arrive [s]")
+    step: float = Field(default=0.02, gt=0, description="RK4 step of these rollouts [s]")
 
     def problems(self) -> Iterator[Problem]:
         if self.step >= self.horizon:
@@ -147,14 +151,14 @@ class GoalConfig(Settings):
 
 
 class FunnelConfig(Settings):
-    rollouts: Literal["closed_form", "mjx", "mixed"] = Field("mixed", description="dynamics of the rollouts")
-    mjx_share: float = Field(0.01, ge=0, le=1, description="share of the fresh samples on MJX when mixed [-]")
-    directions: int = Field(48, ge=1, description="quasi-random directions at each knot [-]")
-    radii: int = Field(12, ge=2, description="log-spaced radii along each direction [-]")
-    steps: int = Field(8, ge=1, description="RK4 steps of a rollout inside an interval [-]")
-    trials: int = Field(64, ge=1, description="fresh uniform states of each final ellipsoid, at each knot [-]")
-    confidence: float = Field(0.99, gt=0, lt=1, description="1 - beta, jointly over the knots [-]")
-    goal: GoalConfig = Field(GoalConfig(), description="region of attraction of the goal's LQR")
+    rollouts: Literal["closed_form", "mjx", "mixed"] = Field(default="mixed", description="dynamics of the rollouts")
+    mjx_share: float = Field(default=0.01, ge=0, le=1, description="share of the fresh samples on MJX when mixed [-]")
+    directions: int = Field(default=48, ge=1, description="quasi-random directions at each knot [-]")
+    radii: int = Field(default=12, ge=2, description="log-spaced radii along each direction [-]")
+    steps: int = Field(default=8, ge=1, description="RK4 steps of a rollout inside an interval [-]")
+    trials: int = Field(default=64, ge=1, description="fresh uniform states of each final ellipsoid, at each knot [-]")
+    confidence: float = Field(default=0.99, gt=0, lt=1, description="1 - beta, jointly over the knots [-]")
+    goal: GoalConfig = Field(default=GoalConfig(), description="region of attraction of the goal's LQR")
 
     def problems(self) -> Iterator[Problem]:
         if self.rollouts == "mixed" and self.mjx_share == 0:
@@ -166,8 +170,8 @@ class FunnelConfig(Settings):
 class NestedConfig(Settings):
     """The paper's two loops: an outer search over designs, each with an inner search over weights."""
 
-    designs: int = Field(8, ge=4, description="outer population; the inner one is population / designs [-]")
-    generations: int = Field(10, ge=1, description="inner generations for each design [-]")
+    designs: int = Field(default=8, ge=4, description="outer population; the inner one is population / designs [-]")
+    generations: int = Field(default=10, ge=1, description="inner generations for each design [-]")
 
 
 SMALLEST_POPULATION = 4
@@ -175,14 +179,20 @@ SMALLEST_POPULATION = 4
 
 
 class SearchConfig(Settings):
-    objective: Literal["sum", "integral", "inlet", "geometric_mean"] = Field("sum", description="volume to maximize")
-    mode: Literal["joint", "nested"] = Field("joint", description="one search over all, or weights inside designs")
-    population: int = Field(128, ge=SMALLEST_POPULATION, description="candidates in a generation [-]")
-    generations: int = Field(60, ge=1, description="generations of the search, the outer ones when nested [-]")
-    sigma: float = Field(0.3, gt=0, le=1, description="initial step size in the unit box [-]")
-    seed: int = Field(0, ge=0, lt=2**32, description="of all random numbers [-]")
-    chunk: int = Field(32, ge=1, description="candidates solved together, which bounds the memory [-]")
-    nested: NestedConfig = Field(NestedConfig(), description="budget of the two loops, used in mode nested alone")
+    objective: Literal["sum", "integral", "inlet", "geometric_mean"] = Field(
+        default="sum", description="volume to maximize"
+    )
+    mode: Literal["joint", "nested"] = Field(
+        default="joint", description="one search over all, or weights inside designs"
+    )
+    population: int = Field(default=128, ge=SMALLEST_POPULATION, description="candidates in a generation [-]")
+    generations: int = Field(default=60, ge=1, description="generations of the search, the outer ones when nested [-]")
+    sigma: float = Field(default=0.3, gt=0, le=1, description="initial step size in the unit box [-]")
+    seed: int = Field(default=0, ge=0, lt=2**32, description="of all random numbers [-]")
+    chunk: int = Field(default=32, ge=1, description="candidates solved together, which bounds the memory [-]")
+    nested: NestedConfig = Field(
+        default=NestedConfig(), description="budget of the two loops, used in mode nested alone"
+    )
 
     def problems(self) -> Iterator[Problem]:
         if self.mode != "nested":
@@ -196,14 +206,16 @@ class SearchConfig(Settings):
 
 
 class ElitesConfig(Settings):
-    count: int = Field(8, ge=1, description="candidates kept and evaluated again [-]")
-    distance: float = Field(0.02, ge=0, lt=1, description="smallest distance between two of them in the unit box [-]")
-    trials: int = Field(2000, ge=1, description="fresh states at each knot of their evaluation [-]")
-    directions: int = Field(192, ge=1, description="fresh directions at each knot of their evaluation [-]")
+    count: int = Field(default=8, ge=1, description="candidates kept and evaluated again [-]")
+    distance: float = Field(
+        default=0.02, ge=0, lt=1, description="smallest distance between two of them in the unit box [-]"
+    )
+    trials: int = Field(default=2000, ge=1, description="fresh states at each knot of their evaluation [-]")
+    directions: int = Field(default=192, ge=1, description="fresh directions at each knot of their evaluation [-]")
 
 
 class CheckpointConfig(Settings):
-    seconds: float = Field(20.0, ge=0, description="least time between two saves [s]")
+    seconds: float = Field(default=20.0, ge=0, description="least time between two saves [s]")
 
 
 class Config(Settings):
@@ -213,11 +225,11 @@ class Config(Settings):
     task: TaskConfig = Field(description="from where to where, and within what")
     design: dict[str, Variable] = Field(description="the plant's design fields by name")
     weights: WeightsConfig = Field(description="cost weights, searched on a log scale")
-    trajectory: TrajectoryConfig = Field(TrajectoryConfig(), description="the nominal motion")
-    funnel: FunnelConfig = Field(FunnelConfig(), description="how the funnel is sampled")
-    search: SearchConfig = Field(SearchConfig(), description="CMA-ES over designs and weights")
-    elites: ElitesConfig = Field(ElitesConfig(), description="the archive of the best")
-    checkpoint: CheckpointConfig = Field(CheckpointConfig(), description="when the state is saved")
+    trajectory: TrajectoryConfig = Field(default=TrajectoryConfig(), description="the nominal motion")
+    funnel: FunnelConfig = Field(default=FunnelConfig(), description="how the funnel is sampled")
+    search: SearchConfig = Field(default=SearchConfig(), description="CMA-ES over designs and weights")
+    elites: ElitesConfig = Field(default=ElitesConfig(), description="the archive of the best")
+    checkpoint: CheckpointConfig = Field(default=CheckpointConfig(), description="when the state is saved")
 
     @field_validator("design")
     @classmethod
@@ -316,13 +328,11 @@ def _across_sections(sections: Mapping[str, Any]) -> Iterator[Problem]:
 
 
 def _valid_sections(data: Mapping[str, Any], failed: set[str | int]) -> dict[str, Any]:
-    fields = {name: field for name, field in Config.model_fields.items() if name not in failed}
-    return {
-        name: TypeAdapter(Annotated[field.annotation, field]).validate_python(data[name])
-        if name in data
-        else field.default
-        for name, field in fields.items()
+    fields: dict[str, Any] = {
+        name: (field.annotation, field) for name, field in Config.model_fields.items() if name not in failed
     }
+    sections = create_model("Sections", **fields)
+    return dict(sections.model_validate({name: data[name] for name in fields if name in data}))
 
 
 def parse(data: Any, source: str = "configuration") -> Config:

@@ -3,7 +3,7 @@
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, cast
 
 import tyro
 from pydantic.fields import FieldInfo
@@ -119,7 +119,7 @@ def _section(settings: Settings, unit: str = "", branches: Mapping[str, Branch] 
         if name in ready or isinstance(value, Settings):
             fields.append(StructFieldSpec(name, Branch, ready.get(name) or _section(value, unit), field.description))
         else:
-            fields.append(StructFieldSpec(name, field.annotation, value, _help(field, unit)))
+            fields.append(StructFieldSpec(name, cast(type, field.annotation), value, _help(field, unit)))
     return Branch(tuple(fields))
 
 

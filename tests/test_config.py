@@ -237,7 +237,7 @@ def test_all_errors_at_once_within_and_between_sections():
     }
     lines = errors(changes)
     assert {line.split(" =")[0].split(":")[0] for line in lines} == changes.keys()
-    with pytest.raises(ConfigError, match="^here: 7 errors\n  "):
+    with pytest.raises(ConfigError, match=r"^here: 7 errors\n  "):
         parse(changed(changes), "here")
 
 
@@ -268,7 +268,7 @@ def test_exponent_without_a_dot_is_a_number():
 def test_missing_file_names_its_neighbours(tmp_path):
     with pytest.raises(ConfigError, match=r"no such file; did you mean '.*pendulum_rtcd.yaml'\? Valid: "):
         load(CONFIGS / "pendulum_rtcdd.yaml")
-    with pytest.raises(ConfigError, match="no such file; .* has no YAML file"):
+    with pytest.raises(ConfigError, match=r"no such file; .* has no YAML file"):
         load(tmp_path / "x.yaml")
 
 

@@ -1,0 +1,177 @@
+"""The architecture, held by the imports: one way between the layers, and heavy packages only where they belong."""
+
+import ast
+import graphlib
+from functools import cache
+from pathlib import Path
+
+import pytest
+
+PACKAGE = Path(__file__).parent.parent / "rtcd_jax"
+
+# From the bottom up; a module imports from its own layer and those below it. A folder stands for all its modules.
+LAYERS = (
+    {"errors", "numerics", "files", "provenance"},
+    {"settings", "types", "console"},
+    {"config"},
+    {"plants"},
+    {"problem"},
+    {"population", "trajectory", "policy", "rollout"},
+    {"funnel", "volume"},
+    {"evaluation"},
+    {"cmaes", "elites", "loops"},
+    {"search"},
+    {"storage"},
+    {"run", "verify", "options", "certificate", "report"},
+    {"cli"},
+)
+
+# Packages that only some modules may import.
+OWNERS = {
+    "mujoco": {"plants.mjx", "report"},
+    "cvxpy": {"certificate"},
+    "orbax": {"storage"},
+    "evosax": {"cmaes"},
+    "rich": {"console", "report"},
+    "tyro": {"options"},
+    "yaml": {"config"},
+    "matplotlib": {"report"},
+    "pydantic": {"settings", "config", "options"},
+    "pydantic_core": {"settings"},
+}
+
+# Mathematics that knows nothing of the project above it.
+ALONE = {
+    "numerics": {"numerics"},
+    "errors": set(),
+    "console": set(),
+    "files": {"errors"},
+    "cmaes": {"cmaes", "numerics", "errors"},
+}
+
+# Modules that must start fast, so that wrong input is refused at once.
+QUICK = ("cli", "console", "config", "errors", "options", "settings")
+HEAVY = {"jax", "jaxtyping", "equinox", "evosax", "mujoco", "orbax", "scipy", "numpy", "matplotlib", "cvxpy"}
+
+
+@cache
+def modules():
+    """Every module's syntax tree by its dotted name inside the package; the package itself is the empty name."""
+    found = {}
+    for path in PACKAGE.rglob("*.py"):
+        parts = path.relative_to(PACKAGE).with_suffix("").parts
+        found[".".join(parts[:-1] if parts[-1] == "__init__" else parts)] = ast.parse(path.read_text())
+    return found
+
+
+def imported(tree, top_level_only=False):
+    """Dotted names of everything that a module imports, lazily too unless `top_level_only`."""
+    nodes = _executed_on_import(tree) if top_level_only else ast.walk(tree)
+    for node in nodes:
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, "relative imports hide the layers"
+            yield from (f"{node.module}.{alias.name}" for alias in node.names)
+
+
+def _executed_on_import(tree):
+    for node in ast.iter_child_nodes(tree):
+        if not isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.Lambda):
+            yield node
+            yield from _executed_on_import(node)
+
+
+def own(names):
+    """Those of the package's modules that the imported names stand for."""
+    for name in names:
+        parts = name.split(".")
+        if parts[0] == "rtcd_jax":
+            inner = ".".join(parts[1:])
+            yield inner if inner in modules() else ".".join(parts[1:-1])
+
+
+def within(module, owners):
+    """The owner that is the module or a folder above it; None if there is none."""
+    return next((owner for owner in owners if module == owner or module.startswith(f"{owner}.")), None)
+
+
+def layer(module):
+    places = [height for height, layer in enumerate(LAYERS) if within(module, layer)]
+    assert len(places) == 1, f"rtcd_jax.{module} has no layer: give it one in LAYERS"
+    return places[0]
+
+
+def below_the_package():
+    return sorted(set(modules()) - {""})
+
+
+@pytest.mark.parametrize("module", below_the_package())
+def test_imports_point_downwards(module):
+    upwards = [other for other in own(imported(modules()[module])) if other and layer(other) > layer(module)]
+    assert upwards == []
+
+
+@pytest.mark.parametrize("module", below_the_package())
+def test_packages_stay_with_their_owners(module):
+    roots = {name.split(".")[0] for name in imported(modules()[module])}
+    strays = [root for root in roots & OWNERS.keys() if not within(module, OWNERS[root])]
+    assert strays == []
+
+
+@pytest.mark.parametrize("module", [name for name in below_the_package() if within(name, ALONE)])
+def test_some_know_nothing_of_the_rest(module):
+    allowed = ALONE[within(module, ALONE)]
+    strangers = [other for other in own(imported(modules()[module])) if not within(other, allowed)]
+    assert strangers == []
+
+
+def test_no_cycles():
+    graph = {name: {other for other in own(imported(tree)) if other != name} for name, tree in modules().items()}
+    graph.pop("")
+    assert set(graphlib.TopologicalSorter(graph).static_order()) >= graph.keys()
+
+
+def loaded_with(module):
+    """Everything that importing a module imports at once, modules of the package followed."""
+    seen, names, open_ends = set(), set(), {module, ""}
+    while open_ends:
+        current = open_ends.pop()
+        seen.add(current)
+        found = set(imported(modules()[current], top_level_only=True))
+        names |= found
+        parents = {parent for inner in own(found) for parent in _and_its_folders(inner)}
+        open_ends |= parents - seen
+    return names
+
+
+def _and_its_folders(module):
+    parts = module.split(".")
+    return {".".join(parts[:length]) for length in range(1, len(parts) + 1)} & modules().keys()
+
+
+@pytest.mark.parametrize("module", QUICK)
+def test_what_must_start_fast_loads_nothing_heavy(module):
+    assert {name.split(".")[0] for name in loaded_with(module)} & HEAVY == set()
+
+
+def test_the_rules_see_what_they_forbid():
+    tree = ast.parse("import jax.numpy as jnp\ndef f():\n    from rtcd_jax.plants import mjx\n")
+    assert list(imported(tree)) == ["jax.numpy", "rtcd_jax.plants.mjx"]
+    assert list(imported(tree, top_level_only=True)) == ["jax.numpy"]
+    assert list(own(imported(tree))) == ["plants.mjx"]
+    assert "jax" in loaded_with("plants.pendulum")
+    assert layer("plants.mjx") < layer("funnel") < layer("cli")
+    assert within("plants.mjx", OWNERS["mujoco"])
+    assert not within("plants.pendulum", OWNERS["mujoco"])
+
+
+def test_public_names_are_those_of_their_modules():
+    import rtcd_jax
+    from rtcd_jax import config, types
+
+    assert {name: getattr(rtcd_jax, name) for name in rtcd_jax.__all__}.keys() <= set(dir(rtcd_jax))
+    assert rtcd_jax.Candidate is types.Candidate
+    assert rtcd_jax.load is config.load
+    with pytest.raises(AttributeError, match="module 'rtcd_jax' has no attribute 'Candidates'"):
+        _ = rtcd_jax.Candidates
