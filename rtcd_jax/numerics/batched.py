@@ -27,25 +27,47 @@ def mtv(a, v):
     return sum(a[k] * v[k] for k in range(a.shape[0]))
 
 
-def spd_solve(a, b, floor=1e-12):
-    """Solve A X = B for symmetric positive definite A [n n P], B [n j P] by Cholesky.
+def transpose(a):
+    """A' for [i k ...]."""
+    return jnp.swapaxes(a, 0, 1)
 
-    Returns X [n j P] and a flag [P] that is false where a pivot fell to `floor` or below; X is finite
-    but meaningless there.
+
+def cholesky(a, floor=0.0):
+    """Lower factor L [n n P] with A = L L', and a flag [P] that is false where a pivot fell to `floor` or below.
+
+    L is finite but meaningless there.
     """
     n = a.shape[0]
-    factor, ok = {}, True
+    factor = [[jnp.zeros_like(a[0, 0])] * n for _ in range(n)]
+    positive = jnp.ones(a.shape[2:], bool)
     for j in range(n):
-        pivot = a[j, j] - sum(factor[j, k] ** 2 for k in range(j))
+        pivot = a[j, j] - sum(factor[j][k] ** 2 for k in range(j))
         good = pivot > floor
-        ok = ok & good
-        factor[j, j] = jnp.sqrt(jnp.where(good, pivot, 1.0))
+        positive = positive & good
+        factor[j][j] = jnp.sqrt(jnp.where(good, pivot, 1.0))
         for i in range(j + 1, n):
-            factor[i, j] = (a[i, j] - sum(factor[i, k] * factor[j, k] for k in range(j))) / factor[j, j]
-    forward = []
-    for i in range(n):
-        forward.append((b[i] - sum(factor[i, k] * forward[k] for k in range(i))) / factor[i, i])
-    back = [None] * n
+            factor[i][j] = (a[i, j] - sum(factor[i][k] * factor[j][k] for k in range(j))) / factor[j][j]
+    return jnp.stack([jnp.stack(row) for row in factor]), positive
+
+
+def solve_lower(factor, b):
+    """L^-1 B for lower L [n n P], B [n j P]."""
+    rows = []
+    for i in range(factor.shape[0]):
+        rows.append((b[i] - sum(factor[i, k] * rows[k] for k in range(i))) / factor[i, i])
+    return jnp.stack(rows)
+
+
+def solve_lower_transposed(factor, b):
+    """L'^-1 B for lower L [n n P], B [n j P]."""
+    n = factor.shape[0]
+    rows = [None] * n
     for i in reversed(range(n)):
-        back[i] = (forward[i] - sum(factor[k, i] * back[k] for k in range(i + 1, n))) / factor[i, i]
-    return jnp.stack(back), ok
+        rows[i] = (b[i] - sum(factor[k, i] * rows[k] for k in range(i + 1, n))) / factor[i, i]
+    return jnp.stack(rows)
+
+
+def spd_solve(a, b, floor=1e-12):
+    """A^-1 B for symmetric positive definite A [n n P], B [n j P]; the flag is that of `cholesky`."""
+    factor, positive = cholesky(a, floor)
+    return solve_lower_transposed(factor, solve_lower(factor, b)), positive

@@ -10,3 +10,10 @@ def rk4_step(f: Callable, x, u, dt):
     k3 = f(x + 0.5 * dt * k2, u)
     k4 = f(x + dt * k3, u)
     return x + dt / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
+
+
+def rk4(f: Callable, x, u, duration, steps: int):
+    """x(t + duration) by equal Runge-Kutta steps."""
+    for _ in range(steps):
+        x = rk4_step(f, x, u, duration / steps)
+    return x

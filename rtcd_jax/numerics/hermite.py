@@ -1,0 +1,12 @@
+"""Cubic Hermite interpolation."""
+
+
+def cubic_hermite(s, duration, start, start_rate, end, end_rate):
+    """The cubic through both ends' values and rates at the fraction s of the interval, elementwise."""
+    s2, s3 = s * s, s * s * s
+    return (
+        (2 * s3 - 3 * s2 + 1) * start
+        + (s3 - 2 * s2 + s) * duration * start_rate
+        + (3 * s2 - 2 * s3) * end
+        + (s3 - s2) * duration * end_rate
+    )

@@ -1,0 +1,36 @@
+"""Directions and points of the unit ball."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+
+def quasi_uniform(key, count: int, dimensions: int, dtype):
+    """`count` points [d count] of the unit cube: an additive recurrence, shifted at random.
+
+    The generators are powers of the root of g^(d+1) = g + 1 (Roberts 2018), the golden ratio for d = 1.
+    """
+    root = 2.0
+    for _ in range(64):
+        root = (1 + root) ** (1 / (dimensions + 1))
+    steps = root ** -np.arange(1.0, dimensions + 1)
+    points = np.outer(steps, np.arange(count)) % 1.0
+    return (jnp.asarray(points, dtype) + jax.random.uniform(key, (dimensions, 1), dtype)) % 1.0
+
+
+def directions(key, count: int, n: int, dtype):
+    """`count` well spread unit vectors [n count]; evenly spaced for n = 2, both directions for n = 1."""
+    if n == 2:
+        turn = 2 * np.pi * (jnp.arange(count, dtype=dtype) + jax.random.uniform(key, (), dtype)) / count
+        return jnp.stack([jnp.cos(turn), jnp.sin(turn)])
+    tiny = float(jnp.finfo(dtype).eps)
+    normal = jax.scipy.special.ndtri(jnp.clip(quasi_uniform(key, count, n, dtype), tiny, 1 - tiny))
+    return normal / jnp.linalg.norm(normal, axis=0)
+
+
+def ball(key, shape: tuple[int, ...], n: int, dtype):
+    """Independent points [n *shape], uniform in the unit ball."""
+    aim, reach = jax.random.split(key)
+    normal = jax.random.normal(aim, (n, *shape), dtype)
+    radius = jax.random.uniform(reach, shape, dtype) ** (1 / n)
+    return normal * (radius / jnp.sqrt(jnp.sum(normal**2, 0)))

@@ -1,0 +1,106 @@
+"""Trajectory -> Policy: the time-varying LQR about it.
+
+S solves -S' = A'S + S A - S B R^-1 B' S + Q backward along (x*, u*), from the value matrix of the goal's own
+infinite-horizon LQR with the same Q and R; K = R^-1 B' S (paper, section II-C). The whole closed loop thereby has one
+value function that continues through t_N.
+"""
+
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from rtcd_jax.numerics import riccati
+from rtcd_jax.numerics.batched import mm, transpose
+from rtcd_jax.numerics.derivatives import jacobian
+from rtcd_jax.numerics.hermite import cubic_hermite
+from rtcd_jax.problem import Problem
+from rtcd_jax.types import Candidate, Policy, Status, Trajectory, first_failure
+
+DOUBLINGS = 8
+"""2^8 short intervals a substep resolve a closed loop of 1000 poles a second at h = 0.1 s."""
+
+
+class Nominal(NamedTuple):
+    """The nominal motion, interval by interval, as the cubic Hermite interpolant of its knots."""
+
+    dt: Float[Array, ""]
+    inputs: Float[Array, "m N"]
+    starts: Float[Array, "n N"]
+    start_rates: Float[Array, "n N"]
+    ends: Float[Array, "n N"]
+    end_rates: Float[Array, "n N"]
+
+    def at(self, shares):
+        """x* [n N T] at fractions `shares` [T] of every interval."""
+        ends = (self.starts, self.start_rates, self.ends, self.end_rates)
+        return cubic_hermite(shares, self.dt, *(leaf[:, :, None] for leaf in ends))
+
+
+def nominal(problem: Problem, candidate: Candidate, trajectory: Trajectory) -> Nominal:
+    """The motion that the controller tracks."""
+    us, xs = trajectory.us.T, trajectory.xs.T
+    rate = partial(problem.plant.dynamics, candidate.design)
+    starts, ends = xs[:, :-1], xs[:, 1:]
+    return Nominal(trajectory.dt, us, starts, rate(starts, us), ends, rate(ends, us))
+
+
+def linearize(problem: Problem, candidate: Candidate, x, u):
+    """A [n n ...] and B [n m ...] of the dynamics at x [n ...], u [m ...]."""
+    n = problem.plant.n
+
+    def dynamics(z):
+        return problem.plant.dynamics(candidate.design, z[:n], z[n:])
+
+    both = jacobian(dynamics, jnp.concatenate([x, u]))
+    return both[:, :n], both[:, n:]
+
+
+def stabilize(problem: Problem, candidate: Candidate, trajectory: Trajectory) -> Policy:
+    """The LQR about a trajectory; RICCATI_INDEFINITE if a value matrix lost positive definiteness."""
+    substeps = problem.config.trajectory.substeps
+    motion = nominal(problem, candidate, trajectory)
+    middles = (np.arange(substeps) + 0.5) / substeps
+    xs = motion.at(middles)
+    us = jnp.broadcast_to(motion.inputs[:, :, None], (problem.plant.m, *xs.shape[1:]))
+    pieces = _interval(problem, candidate, xs, us, trajectory.dt / substeps)
+    whole = jax.tree.map(lambda leaf: leaf[..., 0], pieces)
+    for piece in range(1, substeps):
+        whole = riccati.compose(whole, jax.tree.map(lambda leaf, piece=piece: leaf[..., piece], pieces))
+
+    last, reached = goal_value(problem, candidate)
+
+    def backward(carry, interval):
+        value, definite = riccati.propagate(interval, carry[0])
+        carry = value, carry[1] & definite
+        return carry, value
+
+    stages = jax.tree.map(lambda leaf: jnp.moveaxis(leaf, -1, 0), whole)
+    (_, definite), values = jax.lax.scan(backward, (last, reached), stages, reverse=True)
+    values = jnp.concatenate([values, last[None]])
+    inputs = jnp.concatenate([motion.inputs, jnp.zeros_like(motion.inputs[:, :1])], 1)
+    _, b = linearize(problem, candidate, trajectory.xs.T, inputs)
+    gains = mm(transpose(b) / candidate.r[:, None, None], jnp.moveaxis(values, 0, -1))
+    status = jnp.where(definite, Status.OK, Status.RICCATI_INDEFINITE)
+    return Policy(trajectory, jnp.moveaxis(gains, -1, 0), values, first_failure(trajectory.status, status))
+
+
+def goal_value(problem: Problem, candidate: Candidate):
+    """S [n n] of the goal's infinite-horizon LQR, and whether it exists."""
+    goal = jnp.asarray(problem.goal, candidate.q.dtype)
+    a, b = linearize(problem, candidate, goal, jnp.zeros(problem.plant.m, goal.dtype))
+    return riccati.infinite_horizon(a, _spread(b, candidate.r), jnp.diag(candidate.q))
+
+
+def _interval(problem: Problem, candidate: Candidate, xs, us, duration) -> riccati.Interval:
+    a, b = linearize(problem, candidate, xs, us)
+    cost = jnp.broadcast_to(jnp.diag(candidate.q)[:, :, None, None], a.shape)
+    return riccati.constant_interval(a, _spread(b, candidate.r), cost, duration, DOUBLINGS)
+
+
+def _spread(b, r):
+    """B R^-1 B'."""
+    return mm(b / r.reshape(1, -1, *(1,) * (b.ndim - 2)), transpose(b))

@@ -1,0 +1,46 @@
+"""Genome [d] in the unit box <-> Candidate: boxes, scaling, pinned variables.
+
+Designs are scaled linearly, weights logarithmically; pinned variables have no dimension.
+"""
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from rtcd_jax.problem import Problem, Variable
+from rtcd_jax.types import Candidate
+
+
+def decode(problem: Problem, genome: Float[Array, " d"]) -> Candidate:
+    """The candidate that a genome stands for; entries outside [0, 1] leave the box."""
+    values, dimension = [], 0
+    for variable in problem.variables:
+        if variable.free:
+            values.append(_from_unit(variable, genome[dimension]))
+            dimension += 1
+        else:
+            values.append(jnp.asarray(variable.initial, genome.dtype))
+    plant = problem.plant
+    designs = len(values) - plant.n - plant.m
+    return Candidate(
+        design=plant.Design(*values[:designs]),
+        q=jnp.stack(values[designs : designs + plant.n]),
+        r=jnp.stack(values[designs + plant.n :]),
+    )
+
+
+def initial_genome(problem: Problem) -> np.ndarray:
+    """The genome [d] of the configuration's initial candidate."""
+    return np.array([_to_unit(variable, variable.initial) for variable in problem.free])
+
+
+def _from_unit(variable: Variable, share):
+    if variable.logarithmic:
+        return jnp.exp(np.log(variable.low) + share * np.log(variable.high / variable.low))
+    return variable.low + share * (variable.high - variable.low)
+
+
+def _to_unit(variable: Variable, value: float) -> float:
+    if variable.logarithmic:
+        return float(np.log(value / variable.low) / np.log(variable.high / variable.low))
+    return (value - variable.low) / (variable.high - variable.low)

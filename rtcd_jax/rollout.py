@@ -1,0 +1,158 @@
+"""Policy x states -> end states: the saturated closed loop, by the closed form or by MJX.
+
+On [t_k, t_{k+1}] with the fraction s of the interval:  u = clip(u_k - K(s) (x - x*(s))), x* the cubic Hermite
+interpolant, K linear between K_k and K_{k+1}; after t_N the goal's LQR. Errors of angles are not wrapped. States are
+[n ...], elementwise over all further axes, so that one call carries every knot and sample of a candidate.
+"""
+
+from collections.abc import Callable
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from rtcd_jax.numerics.batched import mv
+from rtcd_jax.plants.base import Plant
+from rtcd_jax.policy import nominal
+from rtcd_jax.problem import Problem
+from rtcd_jax.types import Candidate, Policy
+
+Dynamics = Callable
+"""(design, x [n ...], u [m ...]) -> x' [n ...]."""
+
+
+def closed_form(plant: Plant) -> Dynamics:
+    """The plant's own equations."""
+    return plant.dynamics
+
+
+def mjx(plant: Plant) -> Dynamics:
+    """The plant's MJCF under MJX."""
+    from rtcd_jax.plants.mjx import MjxStepper  # mujoco takes seconds to import
+
+    stepper = MjxStepper(plant)
+
+    def dynamics(design, x, u):
+        over_states = jax.vmap(partial(stepper.dynamics, design), in_axes=-1, out_axes=-1)
+        flat = over_states(x.reshape(plant.n, -1), u.reshape(plant.m, -1))
+        return flat.reshape(x.shape)
+
+    return dynamics
+
+
+class Reference(NamedTuple):
+    """The controller's data at both ends and the middle of every Runge-Kutta step: leading axes (step, stage)."""
+
+    states: Float[Array, "T 3 n N"]
+    gains: Float[Array, "T 3 m n N"]
+    inputs: Float[Array, "m N"]
+    step: Float[Array, ""]
+
+
+def reference(problem: Problem, candidate: Candidate, policy: Policy, steps: int) -> Reference:
+    """The nominal motion and the gains that `steps` Runge-Kutta steps an interval look up."""
+    motion = nominal(problem, candidate, policy.trajectory)
+    grid = np.arange(2 * steps + 1) / (2 * steps)
+    stages = 2 * np.arange(steps)[:, None] + np.arange(3)
+    gains = jnp.moveaxis(policy.gains, 0, -1)[None]
+    shares = grid[:, None, None, None]
+    blended = (1 - shares) * gains[..., :-1] + shares * gains[..., 1:]
+    return Reference(
+        states=jnp.moveaxis(motion.at(grid), -1, 0)[stages],
+        gains=blended[stages],
+        inputs=motion.inputs,
+        step=policy.trajectory.dt / steps,
+    )
+
+
+def roll_intervals(problem: Problem, candidate: Candidate, tracked: Reference, x, dynamics: Dynamics):
+    """End states [n N ...] after one interval each, and whether the boxes on x held at every step [N ...].
+
+    `x` [n N ...] are states at the intervals' starts.
+    """
+    limits = _column(problem.state_limits, x)
+    bounds = _column(problem.input_limits, x)
+    align = partial(_align, behind=x.ndim - 2)
+    feedforward = align(tracked.inputs)
+
+    def step(carry, stage):
+        x, inside = carry
+        states, gains = stage
+
+        def rate(x, point):
+            error = x - align(states[point])
+            u = jnp.clip(feedforward - mv(align(gains[point]), error), -bounds, bounds)
+            return dynamics(candidate.design, x, u)
+
+        x = _rk4_of_time(rate, x, tracked.step)
+        return (x, inside & jnp.all(jnp.abs(x) <= limits, 0)), None
+
+    inside = jnp.all(jnp.abs(x) <= limits, 0)
+    (x, inside), _ = jax.lax.scan(step, (x, inside), (tracked.states, tracked.gains))
+    return x, inside
+
+
+class Arrival(NamedTuple):
+    """`arrived` is true for the states that reached the goal's neighborhood without leaving the boxes."""
+
+    arrived: Bool[Array, "*M"]
+    seconds: Float[Array, ""]
+
+
+def roll_to_goal(
+    problem: Problem, candidate: Candidate, gain, value, near, x, dynamics: Dynamics, horizon: float, step: float
+) -> Arrival:
+    """Roll states [n ...] out under the goal's LQR until all have arrived, that is V <= near, or failed, or time is up."""
+    goal = _column(problem.goal, x)
+    limits, bounds = _column(problem.state_limits, x), _column(problem.input_limits, x)
+    gain, value = _align(gain, x.ndim - 1), _align(value, x.ndim - 1)
+
+    def rate(x, _):
+        u = jnp.clip(-mv(gain, x - goal), -bounds, bounds)
+        return dynamics(candidate.design, x, u)
+
+    def judge(x, inside):
+        inside = inside & jnp.all(jnp.abs(x) <= limits, 0)
+        error = x - goal
+        return inside, inside & (jnp.sum(error * mv(value, error), 0) <= near)
+
+    def advance(state):
+        x, inside, arrived, count = state
+        moved = _rk4_of_time(rate, x, step)
+        still, there = judge(moved, inside)
+        running = inside & ~arrived
+        return (
+            jnp.where(running, moved, x),
+            jnp.where(arrived, inside, still),
+            arrived | (running & there),
+            count + 1,
+        )
+
+    def undecided(state):
+        _, inside, arrived, count = state
+        return jnp.any(inside & ~arrived) & (count < round(horizon / step))
+
+    inside, arrived = judge(x, jnp.ones(x.shape[1:], bool))
+    _, _, arrived, count = jax.lax.while_loop(undecided, advance, (x, inside, arrived, 0))
+    return Arrival(arrived, count * step)
+
+
+def _rk4_of_time(rate, x, dt):
+    """A Runge-Kutta step of x' = rate(x, point) with the data of the step's start (0), middle (1) and end (2)."""
+    k1 = rate(x, 0)
+    k2 = rate(x + 0.5 * dt * k1, 1)
+    k3 = rate(x + 0.5 * dt * k2, 1)
+    k4 = rate(x + dt * k3, 2)
+    return x + dt / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
+
+
+def _align(a, behind: int):
+    """`a` with `behind` axes of length one at its end."""
+    return a.reshape(*a.shape, *(1,) * behind)
+
+
+def _column(values, x):
+    return jnp.asarray(values, x.dtype).reshape(-1, *(1,) * (x.ndim - 1))

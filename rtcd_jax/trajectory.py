@@ -1,0 +1,100 @@
+"""Candidate -> Trajectory: batched multiple shooting.
+
+    min over h, x, u   h sum_k 1/2 [(x_k - x_g)' Q (x_k - x_g) + u_k' R u_k] + w_t h N
+    s.t.  x_{k+1} = Phi(x_k, u_k, h),  x_0 = start,  x_N = goal,  h_min <= h <= h_max,  |x| <= x_max,  |u| <= u_max
+
+Phi integrates the dynamics over one interval with the input held (paper, section II-B, whose DIRTRAN takes one explicit
+midpoint step instead). This verb plans for a whole population at once rather than for one candidate under vmap: the
+solver refills its lanes as candidates finish, so that slow ones do not hold up their neighbours.
+"""
+
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from rtcd_jax.numerics import interior_point
+from rtcd_jax.numerics.integrate import rk4
+from rtcd_jax.problem import Problem
+from rtcd_jax.types import Candidate, Status, Trajectory
+
+
+def plan(problem: Problem, candidates: Candidate) -> Trajectory:
+    """The cheapest trajectory found from a small family of starts, for every candidate [P].
+
+    A candidate's result does not depend on the others. Its status is TRAJECTORY_NOT_SOLVED if no start ended within
+    1e-9 of the interval map and inside the boxes.
+    """
+    settings = problem.config.trajectory
+    parameters = jax.tree.map(lambda leaf: jnp.moveaxis(leaf, 0, -1), candidates)
+    control = interior_point.ControlProblem(
+        stage=partial(_stage, problem, settings.substeps),
+        # One RK4 step per interval is within about 1e-3 of the interval map: enough for a Newton method's derivatives.
+        model=partial(_stage, problem, 1),
+        start=problem.start,
+        goal=problem.goal,
+        state_limits=problem.state_limits,
+        input_limits=problem.input_limits,
+        step_limits=(settings.step.min, settings.step.max),
+    )
+    guesses = starts(problem, parameters.q.dtype)
+    solution = interior_point.solve(
+        control, parameters, guesses, interior_point.Settings(max_iterations=settings.max_iterations)
+    )
+    return _cheapest(solution, guesses.h.shape[-1])
+
+
+def interval_map(problem: Problem, candidate: Candidate, x, u, h, substeps: int):
+    """Phi(x, u, h), elementwise over the axes behind the first."""
+    return rk4(partial(problem.plant.dynamics, candidate.design), x, u, h, substeps)
+
+
+def _stage(problem: Problem, substeps: int, x, u, h, candidate: Candidate):
+    """One interval's end and cost for x [n N P], u [m N P], h [P]."""
+    error = x - problem.goal[:, None, None]
+    q, r = candidate.q[:, None], candidate.r[:, None]
+    running = 0.5 * (jnp.sum(q * error**2, 0) + jnp.sum(r * u**2, 0))
+    cost = h * (running + problem.config.trajectory.time_weight)
+    return interval_map(problem, candidate, x, u, h, substeps), cost
+
+
+def _cheapest(solution: interior_point.Solution, family: int) -> Trajectory:
+    solved = solution.solved.reshape(-1, family)
+    # An unsolved candidate shows the start that came closest.
+    rank = jnp.where(solved, solution.cost.reshape(-1, family), 1e30 + solution.defect.reshape(-1, family))
+    best = jnp.argmin(rank, 1) + family * jnp.arange(solved.shape[0])
+    chosen = jax.tree.map(lambda leaf: jnp.moveaxis(leaf[..., best], -1, 0), solution)
+    return Trajectory(
+        us=chosen.us,
+        xs=chosen.xs,
+        dt=chosen.h,
+        cost=chosen.cost,
+        defect=chosen.defect,
+        iterations=chosen.iterations,
+        status=jnp.where(chosen.solved, Status.OK, Status.TRAJECTORY_NOT_SOLVED).astype(jnp.int32),
+    )
+
+
+def starts(problem: Problem, dtype) -> interior_point.Guess:
+    """The family of starting guesses: rest, then swing to and fro into the goal.
+
+    Which one ends best depends on how many swings the candidate needs; the straight line of the paper's code is poor.
+    """
+    family = [_swing(problem, swings, share) for swings, share in ((2, 0.55), (3, 0.55))]
+    return interior_point.Guess(*(jnp.asarray(np.stack(leaves, -1), dtype) for leaves in zip(*family, strict=True)))
+
+
+def _swing(problem: Problem, swings: int, share: float):
+    """Positions move smoothly in the second half of the time; `share` places h between its limits."""
+    n, count = problem.plant.n, problem.intervals
+    step = problem.config.trajectory.step
+    h = step.min + share * (step.max - step.min)
+    s = np.linspace(0, 1, count + 1)[:, None]
+    late = np.clip(2 * s - 1, 0, 1)
+    travel = problem.goal[: n // 2] - problem.start[: n // 2]
+    ease = late**2 * (3 - 2 * late)
+    swing = -np.sin(np.pi * s) * np.sin(swings * np.pi * s)
+    positions = problem.start[: n // 2] + travel * ease + np.sign(travel) * swing
+    xs = np.concatenate([positions, np.gradient(positions, h * count * s[:, 0], axis=0)], 1)
+    return xs, np.zeros((count, problem.plant.m)), h
