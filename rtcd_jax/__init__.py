@@ -25,6 +25,15 @@ _HOMES = {
     "Volumes": "types",
     "Evaluation": "types",
     "Status": "types",
+    "Problem": "problem",
+    "make_problem": "problem",
+    "decode": "population",
+    "initial_genome": "population",
+    "plan": "trajectory",
+    "stabilize": "policy",
+    "estimate_funnel": "funnel",
+    "funnel_volume": "volume",
+    "make_evaluate": "evaluation",
 }
 
 __all__ = list(_HOMES)  # pyright: ignore[reportUnsupportedDunderAll]

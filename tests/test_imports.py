@@ -32,7 +32,7 @@ OWNERS = {
     "cvxpy": {"certificate"},
     "orbax": {"storage"},
     "evosax": {"cmaes"},
-    "rich": {"console", "report"},
+    "rich": {"console", "verify", "report"},
     "tyro": {"options"},
     "yaml": {"config"},
     "matplotlib": {"report"},
