@@ -1,6 +1,6 @@
 """A whole run with a fake evaluation, for tests that kill it: `python -m tests.search_driver FOLDER MODE SECONDS`.
 
-SECONDS is the time that each generation takes at least. Prints a line when it begins to search, one a generation, and one at its end.
+SECONDS is the least time of a generation. Prints a line when it begins to search, one a generation, one at its end.
 """
 
 import sys
