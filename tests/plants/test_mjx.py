@@ -4,6 +4,7 @@
 
 import subprocess
 import sys
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -11,8 +12,8 @@ import mujoco
 import numpy as np
 import pytest
 
-from rtcd_jax.plants.base import Plant
-from rtcd_jax.plants.mjx import CpuDynamics, MjxStepper, compile_model
+from rtcd_jax.plants import PLANTS
+from rtcd_jax.plants.mjx import CpuDynamics, MjxStepper, compile_model, model_of
 from rtcd_jax.plants.pendulum import Pendulum, PendulumDesign
 
 DT = 0.01
@@ -49,6 +50,15 @@ def test_edited_model_is_the_recompiled_one_in_every_array(robot):
     assert {"body_mass", "body_ipos", "dof_damping", "dof_invweight0", "geom_size"} <= edited.keys()
     for name, array in edited.items():
         np.testing.assert_allclose(array, recompiled[name], rtol=1e-12, atol=1e-15, err_msg=name)
+
+
+def test_a_model_by_name_is_exact_in_any_precision(robot):
+    name = next(name for name, robot_class in PLANTS.items() if isinstance(robot.plant, robot_class))
+    parameters = robot.plant.parameters(robot.design(1))
+    with jax.enable_x64(False):
+        found = _arrays(model_of(name, parameters))
+    for name, array in _arrays(compile_model(robot.plant, robot.design(1))).items():
+        np.testing.assert_array_equal(found[name], array, err_msg=name)
 
 
 def test_c_accelerations_are_the_closed_forms(robot):
@@ -129,7 +139,7 @@ def test_mjx_scans_under_strict_promotion_in_the_states_dtype(robot, dtype):
 def test_the_template_belongs_to_no_trace(robot):
     """A stepper made for the first time inside jit must not leak tracers into the next one."""
 
-    fresh: type[Plant] = type("Fresh", (type(robot.plant),), {})
+    fresh: Any = type("Fresh", (type(robot.plant),), {})
     plant = fresh(*jax.tree.leaves(robot.plant))
     arguments = robot.design(0), robot.x[0], robot.u[0]
     with jax.numpy_rank_promotion("raise"), jax.numpy_dtype_promotion("strict"):
