@@ -36,7 +36,7 @@ $(VENV)/installed-dev: pyproject.toml | $(BIN)/python
 
 $(BIN)/python:
 	@test -n '$(PYTHON)' || { echo 'rtcd_jax needs Python 3.11 or newer; found none. Say which: make PYTHON=/path/to/python3.12'; exit 1; }
-	@'$(PYTHON)' -c '$(RECENT)' || { echo 'rtcd_jax needs Python 3.11 or newer; $(PYTHON) is older'; exit 1; }
+	@'$(PYTHON)' -c '$(RECENT)' || { echo 'rtcd_jax needs Python 3.11 or newer; $(PYTHON) is older or does not run'; exit 1; }
 	'$(PYTHON)' -m venv $(VENV) || { rm -rf $(VENV); echo 'No virtual environment: Debian and Ubuntu need the package python3-venv'; exit 1; }
 
 install = if command -v uv >/dev/null; then uv pip install --python $(BIN)/python -e $(1); \
