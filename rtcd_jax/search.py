@@ -11,7 +11,7 @@ All randomness of a generation is fold_in(key(seed), index): the same state alwa
 import dataclasses
 import functools
 from collections.abc import Callable, Iterator
-from typing import final
+from typing import NamedTuple, Self, final
 
 import equinox as eqx
 import jax
@@ -127,8 +127,17 @@ def step(plan: Plan, evaluate: Evaluate, state: SearchState) -> tuple[SearchStat
     draw, directions, anew = jax.random.split(_key(plan, state.generation), 3)
     strategy, points, genomes = _ask(plan, state.strategy, draw)
     evaluation = evaluate(genomes, directions)
-    after, stops = _tell(plan, state, strategy, points, evaluation, anew)
-    return after, _record(plan, after, evaluation, np.asarray(stops))
+    seen = _Seen.of(evaluation, plan.settings.objective)
+    strategy, stops = _tell(plan, strategy, points, seen.costs, anew)
+    after = SearchState(
+        strategy=strategy,
+        elites=_unbound(_merge(plan, state.elites, evaluation, state.generation)),
+        generation=state.generation + 1,
+        evaluations=state.evaluations + len(seen.costs),
+        restarts=state.restarts + jnp.sum(stops != Stop.NONE, dtype=jnp.int32),
+        counts=state.counts + np.bincount(seen.statuses, minlength=len(Status)).astype(np.int32),
+    )
+    return after, _record(plan, after, seen, np.asarray(stops))
 
 
 def run(plan: Plan, evaluate: Evaluate, state: SearchState) -> Iterator[tuple[SearchState, Generation]]:
@@ -185,30 +194,43 @@ def _ask(plan: Plan, strategy: cmaes.State | NestedState, key: Key[Array, ""]):
 
 
 @functools.partial(jax.jit, static_argnums=0)
-def _tell(plan: Plan, state: SearchState, strategy, points, evaluation: Evaluation, key: Key[Array, ""]):
-    costs = elites.cost(evaluation, plan.settings.objective)
-    strategy, stops = _loop(plan).tell(strategy, points, costs, key)
-    best = elites.merge(state.elites, evaluation, plan.settings.objective, state.generation, plan.elites.distance)
-    after = SearchState(
-        strategy=strategy,
-        elites=best,
-        generation=state.generation + 1,
-        evaluations=state.evaluations + costs.shape[0],
-        restarts=state.restarts + jnp.sum(stops != Stop.NONE, dtype=jnp.int32),
-        counts=state.counts + jnp.bincount(evaluation.status, length=len(Status)).astype(jnp.int32),
-    )
-    return after, stops
+def _tell(plan: Plan, strategy: cmaes.State | NestedState, points, costs: Float[Array, " P"], key: Key[Array, ""]):
+    return _loop(plan).tell(strategy, points, costs, key)
 
 
-def _record(plan: Plan, after: SearchState, evaluation: Evaluation, stops: np.ndarray) -> Generation:
+@functools.partial(jax.jit, static_argnums=0)
+def _merge(plan: Plan, archive: Elites, evaluation: Evaluation, generation: Int[Array, ""]) -> Elites:
+    return elites.merge(archive, evaluation, plan.settings.objective, generation, plan.elites.distance)
+
+
+def _unbound(tree):
+    """The same arrays, tied to no device. Where `evaluate` spreads its work, its results would drag the search along,
+    and a sum over several devices rounds otherwise than the one of a search that went on from a file."""
+    return jax.tree.map(jnp.asarray, jax.device_get(tree))
+
+
+@final
+class _Seen(NamedTuple):
+    """The numbers of a population's evaluation that the search itself looks at, on the host."""
+
+    genomes: np.ndarray
+    statuses: np.ndarray
+    costs: np.ndarray
+    volumes: dict[str, np.ndarray]
+
+    @classmethod
+    def of(cls, evaluation: Evaluation, objective: str) -> Self:
+        volumes = {name: elites.volume(evaluation.volumes, name) for name in elites.OBJECTIVES}
+        costs = elites.cost(evaluation, objective)
+        seen = jax.device_get(cls(evaluation.genome, evaluation.status, costs, volumes))
+        feasible = np.isfinite(seen.costs)
+        return seen._replace(volumes={name: np.where(feasible, v, np.nan) for name, v in seen.volumes.items()})
+
+
+def _record(plan: Plan, after: SearchState, seen: _Seen, stops: np.ndarray) -> Generation:
     objective = plan.settings.objective
-    statuses = np.asarray(evaluation.status)
-    feasible = np.isfinite(np.asarray(elites.cost(evaluation, objective)))
-    volumes = {
-        name: np.where(feasible, np.asarray(elites.volume(evaluation.volumes, name)), np.nan)
-        for name in elites.OBJECTIVES
-    }
-    found = volumes[objective][feasible]
+    feasible = np.isfinite(seen.costs)
+    found = seen.volumes[objective][feasible]
     return Generation(
         index=int(after.generation) - 1,
         evaluations=int(after.evaluations),
@@ -217,13 +239,13 @@ def _record(plan: Plan, after: SearchState, evaluation: Evaluation, stops: np.nd
         median=float(np.median(found)) if found.size else float("nan"),
         best_so_far=_best_so_far(after.elites, objective),
         feasible=float(feasible.mean()),
-        counts={status.name: n for status in Status if (n := int(np.sum(statuses == status)))},
+        counts={status.name: n for status in Status if (n := int(np.sum(seen.statuses == status)))},
         sigma=float(_loop(plan).sigma(after.strategy)),
         restarts=int(after.restarts),
         stops={reason.name: n for reason in Stop if reason and (n := int(np.sum(stops == reason)))},
-        genomes=np.asarray(evaluation.genome),
-        statuses=statuses,
-        volumes=volumes,
+        genomes=seen.genomes,
+        statuses=seen.statuses,
+        volumes=seen.volumes,
     )
 
 

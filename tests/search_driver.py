@@ -1,6 +1,7 @@
 """A whole run with a fake evaluation, for tests that kill it: `python -m tests.search_driver FOLDER MODE SECONDS`.
 
-SECONDS is the least time of a generation. Prints a line when it begins to search, one a generation, one at its end.
+SECONDS is the least time of a generation. Prints a line before it opens the folder, one when it begins
+to search, one a generation, one at its end.
 """
 
 import sys
@@ -43,6 +44,7 @@ def results(found):
 
 def drive(path, config, seconds=0.0):
     plan = plan_of(config)
+    print("opening", flush=True)
     with storage.RunFolder.open(path, config) as folder:
         begun = state = folder.restore(begin(plan))
         print("from", int(begun.generation), flush=True)

@@ -47,28 +47,28 @@ def kill_at_random_moments(path, mode, seconds, kills, rng):
     begun = []
     for _ in range(kills):
         process = driver(path, mode, seconds)
-        lines = [process.stdout.readline() for _ in range(1 + rng.randint(0, 6))]
+        lines = [process.stdout.readline() for _ in range(2 + rng.randint(0, 6))]
         time.sleep(rng.uniform(0.0, 2 * seconds))
         process.send_signal(signal.SIGKILL)
         output = "".join(lines) + end(process)
-        assert output.startswith("from "), output
+        assert output.startswith("opening\nfrom "), output
         if output.endswith("done\n"):
             break
         assert process.returncode == -signal.SIGKILL, output
-        begun.append(int(lines[0].split()[1]))
+        begun.append(int(lines[1].split()[1]))
     return begun
 
 
 def assert_killed_equals_uninterrupted(tmp_path, mode, kills, seconds, seed):
     whole, killed = tmp_path / "whole", tmp_path / "killed"
     output = end(driver(whole, mode))
-    assert output.splitlines() == ["from 0", *(f"generation {k}" for k in range(24)), "done"], output
+    assert output.splitlines() == ["opening", "from 0", *(f"generation {k}" for k in range(24)), "done"], output
     begun = kill_at_random_moments(killed, mode, seconds, kills, random.Random(seed))
     assert len(begun) >= 3
     output = end(driver(killed, mode))
     assert output.endswith("done\n"), output
     assert results(killed) == results(whole)
-    begun.append(int(output.split()[1]))
+    begun.append(int(output.split()[2]))
     assert begun == sorted(begun)
     assert begun[-1] > 0, "no start went on from a saved state"
 
@@ -89,12 +89,14 @@ def test_killed_while_it_starts_a_run_ends_with_the_same_bytes(tmp_path):
     end(driver(whole, "joint"))
     rng = random.Random(3)
     for _ in range(15):
-        process = driver(killed, "joint")
-        while not killed.exists() and process.poll() is None:
-            time.sleep(0.001)
-        time.sleep(rng.uniform(0, 0.3))
+        process = driver(killed, "joint", 0.2)
+        assert process.stdout.readline() == "opening\n"
+        time.sleep(rng.uniform(0, 1.5))
         process.send_signal(signal.SIGKILL)
         end(process)
+        assert process.returncode == -signal.SIGKILL
+    starts = json.loads((killed / "provenance.json").read_text())["starts"]
+    assert len(starts) > 5
     assert end(driver(killed, "joint")).endswith("done\n")
     assert results(killed) == results(whole)
 
@@ -293,7 +295,7 @@ def test_a_folder_that_cannot_be_created_is_named(tmp_path):
 def test_two_processes_cannot_work_on_one_folder(tmp_path):
     process = driver(tmp_path / "run", "joint", 5.0)
     try:
-        assert process.stdout.readline() == "from 0\n"
+        assert [process.stdout.readline() for _ in range(2)] == ["opening\n", "from 0\n"]
         assert f"is in use by process {process.pid} on " in refused(tmp_path / "run", experiment("joint"))
     finally:
         process.kill()
