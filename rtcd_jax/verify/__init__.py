@@ -10,9 +10,9 @@ same states, each with dynamics and integrator of its own:
 
 import io
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Any, Protocol, final
+from typing import Any, NamedTuple, Protocol, final
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -41,6 +41,8 @@ STEP_OF_FASTEST = 0.25
 """Longest fixed step in time constants of the loop's fastest mode."""
 RELATIVE, ABSOLUTE = 1e-8, 1e-9
 """Tolerances of RK45 for every state."""
+STACKED = 1000
+"""States that RK45 takes as one: all of them wait whenever one crosses its input limit."""
 
 
 class Console(Protocol):
@@ -125,22 +127,47 @@ def verify_funnel(elite: Elite, states: int = 1000, seed: int = 0) -> Verificati
     if states < len(elite.time):
         raise UserError(f"states = {states}: must be at least {len(elite.time)}, one for each knot's ellipsoid")
     knots, x = elite.sample(states, np.random.default_rng(seed))
-    outcomes = {name: simulate(elite, f, march, knots, x) for name, f, march in witnesses(elite, states)}
+    outcomes = {witness.name: _seen_by(witness, elite, knots, x) for witness in witnesses(elite, states)}
     return Verification(knots, x, outcomes, elite.epsilon, elite.confidence, seed)
 
 
-def witnesses(elite: Elite, states: int) -> Iterator[tuple[str, Dynamics, March]]:
-    """Name, dynamics and integrator of everyone who can simulate this elite's plant, at most `states` at a time."""
+@final
+class Witness(NamedTuple):
+    """Someone who simulates a plant, best with about `chunk` states at a time."""
+
+    name: str
+    dynamics: Dynamics
+    march: March
+    chunk: int
+
+
+def _seen_by(witness: Witness, elite: Elite, knots: np.ndarray, x: np.ndarray) -> Outcome:
+    """Interleaved chunks, so that each has states of every knot."""
+    chunks = -(-len(x) // witness.chunk)
+    outcomes = [
+        simulate(elite, witness.dynamics, witness.march, knots[chunk::chunks], x[chunk::chunks])
+        for chunk in range(chunks)
+    ]
+    merged = {field.name: np.zeros(len(x), bool) for field in fields(Outcome)}
+    for name, seen in merged.items():
+        for chunk, outcome in enumerate(outcomes):
+            seen[chunk::chunks] = getattr(outcome, name)
+    return Outcome(**merged)
+
+
+def witnesses(elite: Elite, states: int) -> Iterator[Witness]:
+    """Everyone who can simulate this elite's plant, `states` at most."""
     from rtcd_jax.plants.mjx import CpuDynamics, model_of
 
     interval = float(np.min(np.diff(elite.time)))
     columns = elite.x_goal.size + elite.u_max.size
     mujoco = CpuDynamics(model_of(elite.plant, elite.parameters), max(states, columns, 2))
     step = min(interval / STEPS, STEP_OF_FASTEST / fastest_rate(elite, mujoco))
-    yield "C MuJoCo", mujoco, runge_kutta(mujoco, step)
+    yield Witness("C MuJoCo", mujoco, runge_kutta(mujoco, step), chunk=states)
     if elite.plant in CLOSED_FORMS:
         closed_form = CLOSED_FORMS[elite.plant](elite.parameters)
-        yield "closed form", closed_form, dormand_prince(closed_form, interval / 4, RELATIVE, ABSOLUTE)
+        march = dormand_prince(closed_form, interval / 4, RELATIVE, ABSOLUTE)
+        yield Witness("closed form", closed_form, march, STACKED)
 
 
 def _pendulum(p: Mapping[str, float]) -> Dynamics:
