@@ -192,7 +192,7 @@ def _weights_of_ranks(population, ranks, state, params):
 
 @functools.cache
 def _evosax(dimensions: int, population: int):
-    if not jax.config.jax_enable_x64:
+    if jnp.result_type(float) != jnp.float64:
         raise ValueError("CMA-ES needs float64, but jax_enable_x64 is False: set it before the search starts")
     # A first call inside jit would otherwise keep its tracers in the cache.
     with jax.ensure_compile_time_eval():
