@@ -4,16 +4,17 @@ Trajectories are planned for the whole population at once, because the solver ba
 them is written for one candidate and mapped over chunks, which bounds the memory.
 """
 
-import dataclasses
 from collections.abc import Callable
 from functools import partial
 
 import jax
 import jax.numpy as jnp
+import numpy as np
+from jax.sharding import AxisType, Mesh, PartitionSpec
 
 from rtcd_jax import rollout
-from rtcd_jax.config import FunnelConfig
-from rtcd_jax.funnel import Dynamics, estimate_funnel
+from rtcd_jax.confirmation import Dynamics, Effort
+from rtcd_jax.funnel import estimate_funnel
 from rtcd_jax.policy import stabilize
 from rtcd_jax.population import decode
 from rtcd_jax.problem import Problem
@@ -23,57 +24,69 @@ from rtcd_jax.volume import funnel_volume
 
 SEARCH_ROUNDS = 2
 ELITE_ROUNDS = 40
-"""Passes of fresh states at most, see `estimate_funnel`."""
 
-
-@dataclasses.dataclass(frozen=True)
-class Effort:
-    """How thoroughly a funnel is sampled."""
-
-    funnel: FunnelConfig
-    dynamics: Dynamics
-    rounds: int
-    chunk: int
+Evaluate = Callable[[jax.Array, jax.Array], Evaluation]
 
 
 def search_effort(problem: Problem) -> Effort:
-    """That of a generation."""
-    config = problem.config
-    closed_form = rollout.closed_form(problem.plant)
-    match config.funnel.rollouts:
-        case "closed_form":
-            dynamics = Dynamics(closed_form, closed_form, closed_form)
-        case "mixed":
-            dynamics = Dynamics(closed_form, closed_form, closed_form, share=rollout.mjx(problem.plant))
-        case "mjx":
-            dynamics = Dynamics(*[rollout.mjx(problem.plant)] * 3)
-    return Effort(config.funnel, dynamics, SEARCH_ROUNDS, config.search.chunk)
+    """That of a generation: two passes of fresh states, a share of them through MJX if the rollouts are mixed."""
+    funnel = problem.config.funnel
+    share = rollout.mjx(problem.plant) if funnel.rollouts == "mixed" else None
+    use = rollout.mjx if funnel.rollouts == "mjx" else rollout.closed_form
+    physics = use(problem.plant)
+    return Effort(funnel, Dynamics(physics, physics, physics, share), SEARCH_ROUNDS)
 
 
 def elite_effort(problem: Problem) -> Effort:
-    """That of the elites' re-evaluation: more directions, more fresh states, all of them through MJX unless closed form."""
+    """That of the elites: more directions and fresh states, through MJX unless all is closed form, until none fails.
+
+    Fresh states are then followed to the goal.
+    """
     config = problem.config
-    elites = config.elites
-    funnel = config.funnel.model_copy(update={"directions": elites.directions, "trials": elites.trials})
+    counts = {"directions": config.elites.directions, "trials": config.elites.trials}
     use = rollout.closed_form if config.funnel.rollouts == "closed_form" else rollout.mjx
-    return Effort(funnel, Dynamics(*[use(problem.plant)] * 3), ELITE_ROUNDS, chunk=1)
+    physics = use(problem.plant)
+    funnel = config.funnel.model_copy(update=counts)
+    return Effort(funnel, Dynamics(physics, physics, physics), ELITE_ROUNDS, follow=True)
 
 
-def make_evaluate(problem: Problem, effort: Effort | None = None) -> Callable:
-    """`evaluate(genomes [P d], key) -> Evaluation [P]`; all candidates share the key's random directions."""
+def make_evaluate(problem: Problem, effort: Effort | None = None) -> Evaluate:
+    """`evaluate(genomes [P d], key) -> Evaluation [P]`, to be jitted; all candidates share the key's random numbers.
+
+    Without an `effort` that of a generation is made.
+    """
     effort = effort or search_effort(problem)
 
     def evaluate(genomes, key) -> Evaluation:
         candidates = jax.vmap(partial(decode, problem))(genomes)
         trajectories = plan(problem, candidates)
         assess = partial(_assess, problem, effort, key)
-        return jax.lax.map(assess, (genomes, candidates, trajectories), batch_size=effort.chunk)
+        chunk = min(problem.config.search.chunk, genomes.shape[0])
+        return jax.lax.map(assess, (genomes, candidates, trajectories), batch_size=chunk)
 
     return evaluate
+
+
+def spread(evaluate: Evaluate, devices: list[jax.Device]) -> Evaluate:
+    """The same evaluation, jitted, with the candidates shared out evenly over devices; the last ones are padded."""
+    mesh = Mesh(np.array(devices), ("candidates",), axis_types=(AxisType.Auto,))
+    split, whole = PartitionSpec("candidates"), PartitionSpec()
+    # Every device runs loops of its own length: there is nothing to keep in step.
+    shared = jax.jit(
+        jax.shard_map(evaluate, mesh=mesh, in_specs=(split, whole), out_specs=split, check_vma=False)
+    )
+
+    def on_all(genomes, key) -> Evaluation:
+        count = genomes.shape[0]
+        padding = jnp.repeat(genomes[-1:], -count % len(devices), 0)
+        evaluation = shared(jnp.concatenate([genomes, padding]), key)
+        return jax.tree.map(lambda leaf: leaf[:count], evaluation)
+
+    return on_all
 
 
 def _assess(problem: Problem, effort: Effort, key, planned: tuple[jax.Array, Candidate, Trajectory]) -> Evaluation:
     genome, candidate, trajectory = planned
     policy = stabilize(problem, candidate, trajectory)
-    funnel = estimate_funnel(problem, candidate, policy, key, effort.funnel, effort.dynamics, effort.rounds)
+    funnel = estimate_funnel(problem, candidate, policy, key, effort)
     return Evaluation(genome, candidate, funnel, funnel_volume(funnel), funnel.status)

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 
 from rtcd_jax.numerics.batched import mv
 from rtcd_jax.plants.base import Plant
@@ -50,6 +50,10 @@ class Reference(NamedTuple):
     gains: Float[Array, "T 3 m n N"]
     inputs: Float[Array, "m N"]
     step: Float[Array, ""]
+
+    def part(self, which) -> "Reference":
+        """The intervals `which`."""
+        return Reference(self.states[..., which], self.gains[..., which], self.inputs[..., which], self.step)
 
 
 def reference(problem: Problem, candidate: Candidate, policy: Policy, steps: int) -> Reference:
@@ -95,49 +99,20 @@ def roll_intervals(problem: Problem, candidate: Candidate, tracked: Reference, x
     return x, inside
 
 
-class Arrival(NamedTuple):
-    """`arrived` is true for the states that reached the goal's neighborhood without leaving the boxes."""
-
-    arrived: Bool[Array, "*M"]
-    seconds: Float[Array, ""]
-
-
-def roll_to_goal(
-    problem: Problem, candidate: Candidate, gain, value, near, x, dynamics: Dynamics, horizon: float, step: float
-) -> Arrival:
-    """Roll states [n ...] out under the goal's LQR until all have arrived, that is V <= near, or failed, or time is up."""
-    goal = _column(problem.goal, x)
-    limits, bounds = _column(problem.state_limits, x), _column(problem.input_limits, x)
-    gain, value = _align(gain, x.ndim - 1), _align(value, x.ndim - 1)
+def roll_at_goal(problem: Problem, candidate: Candidate, gain, x, dynamics: Dynamics, duration: float, step: float):
+    """End states [n ...] after `duration` [s] under the goal's LQR, and whether the boxes on x held on the way [...]."""
+    goal, limits, bounds = (_column(a, x) for a in (problem.goal, problem.state_limits, problem.input_limits))
+    gain = _align(gain, x.ndim - 1)
 
     def rate(x, _):
-        u = jnp.clip(-mv(gain, x - goal), -bounds, bounds)
-        return dynamics(candidate.design, x, u)
+        return dynamics(candidate.design, x, jnp.clip(-mv(gain, x - goal), -bounds, bounds))
 
-    def judge(x, inside):
-        inside = inside & jnp.all(jnp.abs(x) <= limits, 0)
-        error = x - goal
-        return inside, inside & (jnp.sum(error * mv(value, error), 0) <= near)
+    def advance(_, carry):
+        x, inside = carry
+        x = _rk4_of_time(rate, x, step)
+        return x, inside & jnp.all(jnp.abs(x) <= limits, 0)
 
-    def advance(state):
-        x, inside, arrived, count = state
-        moved = _rk4_of_time(rate, x, step)
-        still, there = judge(moved, inside)
-        running = inside & ~arrived
-        return (
-            jnp.where(running, moved, x),
-            jnp.where(arrived, inside, still),
-            arrived | (running & there),
-            count + 1,
-        )
-
-    def undecided(state):
-        _, inside, arrived, count = state
-        return jnp.any(inside & ~arrived) & (count < round(horizon / step))
-
-    inside, arrived = judge(x, jnp.ones(x.shape[1:], bool))
-    _, _, arrived, count = jax.lax.while_loop(undecided, advance, (x, inside, arrived, 0))
-    return Arrival(arrived, count * step)
+    return jax.lax.fori_loop(0, round(duration / step), advance, (x, jnp.all(jnp.abs(x) <= limits, 0)))
 
 
 def _rk4_of_time(rate, x, dt):

@@ -1,10 +1,12 @@
 """Ellipsoids {x : x' S x <= rho} through the Cholesky factor of S; matrices first, elementwise over further axes."""
 
 from math import lgamma, log, pi
+from typing import NamedTuple
 
 import jax.numpy as jnp
+from jaxtyping import Array, Float
 
-from rtcd_jax.numerics.batched import solve_lower, solve_lower_transposed
+from rtcd_jax.numerics.batched import cholesky, mv, solve_lower, solve_lower_transposed
 
 
 def from_ball(factor, y):
@@ -25,3 +27,38 @@ def half_widths(factor):
     n = factor.shape[0]
     eye = jnp.broadcast_to(jnp.eye(n, dtype=factor.dtype).reshape(n, n, *(1,) * (factor.ndim - 2)), factor.shape)
     return jnp.sqrt(jnp.sum(solve_lower(factor, eye) ** 2, 0))
+
+
+class Ellipsoids(NamedTuple):
+    """A row of sets {x : (x - center)' S (x - center) <= rho}, with K of them on the last axis; `factors` L, S = L L'."""
+
+    centers: Float[Array, "n K"]
+    values: Float[Array, "n n K"]
+    factors: Float[Array, "n n K"]
+
+    @classmethod
+    def about(cls, centers, values) -> "Ellipsoids":
+        return cls(centers, values, cholesky(values)[0])
+
+    def part(self, which: slice) -> "Ellipsoids":
+        """Some of them."""
+        return Ellipsoids(*(leaf[..., which] for leaf in self))
+
+    def points(self, radii, y):
+        """x [n K ...] with V(x) = (radii |y|)^2, for radii [K ...] and y [n ...] or [n K ...]."""
+        y = jnp.broadcast_to(y, (y.shape[0], *radii.shape))
+        return _behind(self.centers, radii.ndim - 1) + from_ball(_behind(self.factors, radii.ndim - 1), radii * y)
+
+    def level(self, x):
+        """V(x) [K ...] of x [n K ...]."""
+        error = x - _behind(self.centers, x.ndim - 2)
+        return jnp.sum(error * mv(_behind(self.values, x.ndim - 2), error), 0)
+
+    def radii_inside(self, limits):
+        """The largest sqrt(rho) [K] for which |x_i| <= limits_i everywhere in the set; 0 if not even the center is."""
+        room = limits[:, None] - jnp.abs(self.centers)
+        return jnp.maximum(jnp.min(room / half_widths(self.factors), 0), 0.0)
+
+
+def _behind(a, count: int):
+    return a.reshape(*a.shape, *(1,) * count)

@@ -1,0 +1,155 @@
+"""Fresh states for a funnel: what (epsilon, beta) rests on.
+
+Independent states, uniform in each ellipsoid, are rolled out; a failure shrinks its level, and everything is repeated
+with new states until a whole pass has none. M states without a failure leave a failure probability of at most
+1 - beta^(1/M) with confidence 1 - beta.
+"""
+
+import dataclasses
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from rtcd_jax import rollout
+from rtcd_jax.config import FunnelConfig
+from rtcd_jax.numerics import sampling
+from rtcd_jax.numerics.ellipsoid import Ellipsoids
+
+SAFETY = 0.99
+"""Level over that of the lowest fresh state that failed."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Dynamics:
+    """Whose physics the directions, the rollouts at the goal and the fresh states feel; `share` a part of these."""
+
+    directions: rollout.Dynamics
+    goal: rollout.Dynamics
+    fresh: rollout.Dynamics
+    share: rollout.Dynamics | None = None
+
+
+@dataclasses.dataclass(frozen=True)
+class Effort:
+    """How thoroughly a funnel is sampled: passes of fresh states at most, and whether these are followed to the goal."""
+
+    funnel: FunnelConfig
+    dynamics: Dynamics
+    rounds: int
+    follow: bool = False
+
+
+class _Confirmed(NamedTuple):
+    levels: Float[Array, " K"]
+    failures: Int[Array, " K"]
+    clean: Bool[Array, ""]
+    round: Int[Array, ""]
+
+
+def confirm(problem, candidate, sets: Ellipsoids, tracked, levels, key, effort: Effort):
+    """Levels [K] and trials [K] after fresh states were rolled out over one interval each: B_k into B_{k+1}.
+
+    The last level keeps zero trials: no interval starts there.
+    """
+    starts, nexts = sets.part(slice(0, -1)), sets.part(slice(1, None))
+
+    def one_pass(levels, key):
+        inner, share = jax.random.split(key)
+        x = _fresh(starts, levels[:-1], inner, effort.funnel.trials)
+        ends, inside = rollout.roll_intervals(problem, candidate, tracked, x, effort.dynamics.fresh)
+        if effort.dynamics.share is not None:
+            which = _share(share, x.shape[1], effort.funnel)
+            part = tracked.part(which.knots)
+            chosen = x[:, which.knots, : which.states]
+            new_ends, new_inside = rollout.roll_intervals(problem, candidate, part, chosen, effort.dynamics.share)
+            ends = ends.at[:, which.knots, : which.states].set(new_ends)
+            inside = inside.at[which.knots, : which.states].set(new_inside)
+        shrunk, failures = _shrink(levels, starts.level(x), nexts.level(ends), inside)
+        return shrunk, jnp.append(failures, 0)
+
+    done = _repeat(one_pass, levels, key, effort.rounds)
+    trials = jnp.where(done.failures == 0, effort.funnel.trials, 0).at[-1].set(0)
+    return done.levels, trials.astype(jnp.int32)
+
+
+def follow(problem, candidate, policy, sets: Ellipsoids, tracked, levels, key, effort: Effort):
+    """Levels [K] and trials [K] after fresh states of all knots were followed to the goal, by the closed form.
+
+    A state fails if it leaves the funnel at a later knot, leaves the boxes, or does not come closer to the goal (by its
+    V) over the horizon after t_N. Only the level at which it started shrinks.
+    """
+    count, goal = effort.funnel.trials, effort.funnel.goal
+    dynamics = rollout.closed_form(problem.plant)
+    knots = levels.shape[0]
+
+    def one_pass(levels, key):
+        begun = _fresh(sets, levels, key, count)
+        flat = begun.reshape(begun.shape[0], 1, -1)  # every state is in the same interval at the same time
+
+        def interval(carry, k):
+            x, held = carry
+            here, after = k + np.arange(1), k + 1 + np.arange(1)
+            ends, inside = rollout.roll_intervals(problem, candidate, tracked.part(here), x, dynamics)
+            fine = inside & (sets.part(after).level(ends) <= levels[k + 1])
+            running = jnp.repeat(jnp.arange(knots) <= k, count)[None]
+            return (jnp.where(running, ends, x), held & (fine | ~running)), None
+
+        (x, held), _ = jax.lax.scan(interval, (flat, jnp.ones(flat.shape[1:], bool)), jnp.arange(knots - 1))
+        gain, last = policy.gains[-1], sets.part(slice(-1, None))
+        ends, inside = rollout.roll_at_goal(problem, candidate, gain, x, dynamics, goal.horizon, goal.step)
+        failed = ~(held & inside & (last.level(ends) < last.level(x))).reshape(knots, count)
+        lowest = jnp.min(jnp.where(failed, sets.level(begun), jnp.inf), 1)
+        return jnp.minimum(levels, SAFETY * lowest), jnp.sum(failed, 1)
+
+    done = _repeat(one_pass, levels, key, effort.rounds)
+    return done.levels, jnp.where(done.failures == 0, count, 0).astype(jnp.int32)
+
+
+def _repeat(one_pass: Callable, levels, key, rounds: int) -> _Confirmed:
+    def again(state: _Confirmed):
+        levels, failures = one_pass(state.levels, jax.random.fold_in(key, state.round))
+        return _Confirmed(levels, failures, jnp.sum(failures) == 0, state.round + 1)
+
+    state = _Confirmed(levels, jnp.zeros(levels.shape, int), jnp.asarray(False), jnp.asarray(0))
+    return jax.lax.while_loop(lambda state: ~state.clean & (state.round < rounds), again, state)
+
+
+def _fresh(sets: Ellipsoids, levels, key, count: int):
+    """States [n K count], uniform in each ellipsoid."""
+    shape = (levels.shape[0], count)
+    y = sampling.ball(key, shape, sets.centers.shape[0], levels.dtype)
+    return sets.points(jnp.broadcast_to(jnp.sqrt(levels)[:, None], shape), y)
+
+
+def _shrink(levels, starts, ends, inside):
+    """Levels below the lowest fresh state that failed, backward over the knots, and how many failed [N]."""
+
+    def backward(target, knot):
+        level, starts, ends, inside = knot
+        failed = ~(inside & (ends <= target))
+        lowest = jnp.min(jnp.where(failed, starts, jnp.inf))
+        shrunk = jnp.minimum(level, SAFETY * lowest)
+        return shrunk, (shrunk, jnp.sum(failed))
+
+    _, (shrunk, failures) = jax.lax.scan(backward, levels[-1], (levels[:-1], starts, ends, inside), reverse=True)
+    return jnp.append(shrunk, levels[-1]), failures
+
+
+class _Share(NamedTuple):
+    knots: Int[Array, " chosen"]
+    states: int
+
+
+def _share(key, knots: int, funnel: FunnelConfig) -> _Share:
+    """A random share of the fresh states, the same for all candidates.
+
+    The states of one knot are exchangeable: the first few of randomly chosen knots are as good as any.
+    """
+    per_knot = funnel.mjx_share * funnel.trials
+    states = max(1, round(per_knot))
+    chosen = max(1, round(knots * min(1.0, per_knot / states)))
+    return _Share(jax.random.permutation(key, np.arange(knots))[:chosen], states)
