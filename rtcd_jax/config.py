@@ -62,7 +62,23 @@ class PendulumConfig(PlantConfig):
     torque_limit: float = Field(default=2.5, gt=0, description="largest |torque| of the motor [N m]")
 
 
-PLANTS: dict[str, type[PlantConfig]] = {"pendulum": PendulumConfig}
+class CartpoleConfig(PlantConfig):
+    states: ClassVar = {"cart": "m", "theta": "rad", "cart_dot": "m/s", "theta_dot": "rad/s"}
+    inputs: ClassVar = {"force": "N"}
+    design: ClassVar = {"pole_length": "m", "pole_mass": "kg"}
+
+    name: Literal["cartpole"] = Field(default="cartpole", description="force-limited cart-pole (paper, section III)")
+    cart_mass: float = Field(default=1.0731266, gt=0, description="mass of the cart, its motor's inertia included [kg]")
+    cart_damping: float = Field(default=5.4, ge=0, description="viscous friction of the cart [N s/m]")
+    pivot_damping: float = Field(default=0.0024, ge=0, description="viscous friction at the pivot [N m s/rad]")
+    gravity: float = Field(default=9.81, gt=0, description="gravitational acceleration [m/s^2]")
+    force_limit: float = Field(default=6.0, gt=0, description="largest |force| on the cart [N]")
+    inertia: Literal["rod", "measured"] = Field(
+        default="rod", description="of the pole about its center of mass: a uniform rod's, or the measured constant"
+    )
+
+
+PLANTS: dict[str, type[PlantConfig]] = {"pendulum": PendulumConfig, "cartpole": CartpoleConfig}
 
 
 def _read_plant(data: Any) -> PlantConfig:

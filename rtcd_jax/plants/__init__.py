@@ -3,9 +3,10 @@
 import difflib
 
 from rtcd_jax.plants.base import Plant
+from rtcd_jax.plants.cartpole import Cartpole
 from rtcd_jax.plants.pendulum import Pendulum
 
-PLANTS: dict[str, type[Plant]] = {"pendulum": Pendulum}
+PLANTS: dict[str, type[Plant]] = {"pendulum": Pendulum, "cartpole": Cartpole}
 
 
 def plant_class(name: str) -> type[Plant]:

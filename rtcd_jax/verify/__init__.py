@@ -178,7 +178,27 @@ def _pendulum(p: Mapping[str, float]) -> Dynamics:
     return f
 
 
-CLOSED_FORMS: dict[str, Callable[[Mapping[str, float]], Dynamics]] = {"pendulum": _pendulum}
+def _cartpole(p: Mapping[str, float]) -> Dynamics:
+    """Lagrange's equations M(theta) (cart_ddot, theta_ddot) = tau by Cramer's rule.
+
+    T = Mc/2 cart_dot^2 + Mp/2 |(cart_dot - lp cos(theta) theta_dot, -lp sin(theta) theta_dot)|^2 + I/2 theta_dot^2,
+    U = Mp g lp cos(theta)
+    """
+
+    def f(x: np.ndarray, u: np.ndarray) -> np.ndarray:
+        _, theta, speed, rate = x.T
+        m11, m22 = p["Mc"] + p["Mp"], p["inertia_about_com"] + p["Mp"] * p["lp"] ** 2
+        m12 = -p["Mp"] * p["lp"] * np.cos(theta)
+        tau1 = u[:, 0] - p["Beq"] * speed - p["Mp"] * p["lp"] * np.sin(theta) * rate**2
+        tau2 = p["Mp"] * p["lp"] * p["g"] * np.sin(theta) - p["Bp"] * rate
+        determinant = m11 * m22 - m12**2
+        cart = (m22 * tau1 - m12 * tau2) / determinant
+        return np.column_stack([speed, rate, cart, (m11 * tau2 - m12 * tau1) / determinant])
+
+    return f
+
+
+CLOSED_FORMS: dict[str, Callable[[Mapping[str, float]], Dynamics]] = {"pendulum": _pendulum, "cartpole": _cartpole}
 """By plant: its physical numbers -> dynamics. A plant that is not here has one witness, C MuJoCo."""
 
 

@@ -30,6 +30,18 @@ def _redesign_pendulum(spec: mujoco.MjSpec, parameters: dict[str, float]) -> Non
     spec.geom("rod").size = [spec.geom("rod").size[0], length / 2, 0]
 
 
+def _redesign_cartpole(spec: mujoco.MjSpec, parameters: dict[str, float]) -> None:
+    center, inertia = [0, 0, parameters["lp"]], parameters["inertia_about_com"]
+    spec.option.gravity = [0, 0, -parameters["g"]]
+    spec.body("cart").mass = parameters["Mc"]
+    pole = spec.body("pole")
+    pole.mass, pole.ipos, pole.inertia = parameters["Mp"], center, [inertia, inertia, pole.inertia[2]]
+    spec.joint("cart").damping[0] = parameters["Beq"]
+    spec.joint("theta").damping[0] = parameters["Bp"]
+    spec.geom("pole").pos = center
+    spec.geom("pole").size = [spec.geom("pole").size[0], parameters["lp"], 0]
+
+
 class Row(NamedTuple):
     constants: dict[str, float]
     lowest: dict[str, float]
@@ -43,6 +55,12 @@ ROBOTS = {
         {"mass": 0.6, "length": 0.4},
         {"mass": 0.8, "length": 0.6},
         _redesign_pendulum,
+    ),
+    "cartpole": Row(
+        {"cart_mass": 1.1, "cart_damping": 5.2, "pivot_damping": 0.003, "gravity": 9.7},
+        {"pole_length": 0.1778, "pole_mass": 0.127},
+        {"pole_length": 0.3, "pole_mass": 0.3},
+        _redesign_cartpole,
     ),
 }
 

@@ -9,8 +9,9 @@ import mujoco
 import numpy as np
 import pytest
 
-from rtcd_jax.plants import plant_class
+from rtcd_jax.plants import PLANTS, plant_class
 from rtcd_jax.plants.mjx import compile_model
+from rtcd_jax.verify import CLOSED_FORMS
 
 
 def test_energy_changes_by_the_motors_power_less_the_dampers(robot):
@@ -85,5 +86,13 @@ def test_pendulum_balances_at_the_torque_of_its_weight():
 
 
 def test_an_unknown_plant_is_answered_with_the_known_ones():
-    with pytest.raises(ValueError, match=r"'pendulun'; there are pendulum.*did you mean 'pendulum'"):
+    with pytest.raises(ValueError, match=r"'pendulun'; there are cartpole, pendulum.*did you mean 'pendulum'"):
         plant_class("pendulun")
+
+
+def test_the_verifications_own_closed_form_is_the_plants(robot):
+    name = next(name for name, robot_class in PLANTS.items() if isinstance(robot.plant, robot_class))
+    for index in range(3):
+        witness = CLOSED_FORMS[name](robot.plant.parameters(robot.design(index)))
+        expected = jax.vmap(lambda x, u, i=index: robot.plant.dynamics(robot.design(i), x, u))(robot.x, robot.u)
+        np.testing.assert_allclose(witness(np.asarray(robot.x), np.asarray(robot.u)), expected, rtol=1e-11, atol=1e-11)
