@@ -153,13 +153,10 @@ class TrajectoryConfig(Settings):
 class GoalConfig(Settings):
     """The region of attraction of the goal's LQR, from which the last level follows."""
 
-    directions: int = Field(default=64, ge=1, description="quasi-random directions about the goal [-]")
-    radii: int = Field(default=8, ge=2, description="radii along each direction [-]")
-    rounds: int = Field(
-        default=3, ge=1, description="refinements of the level, each between its neighbouring radii [-]"
-    )
-    horizon: float = Field(default=8.0, gt=0, description="time within which a rollout must arrive [s]")
-    step: float = Field(default=0.02, gt=0, description="RK4 step of these rollouts [s]")
+    directions: int = Field(32, ge=1, description="quasi-random directions about the goal [-]")
+    radii: int = Field(10, ge=2, description="radii along each direction, in each of two passes [-]")
+    horizon: float = Field(2.0, gt=0, description="time over which a rollout must come closer to the goal [s]")
+    step: float = Field(0.02, gt=0, description="RK4 step of these rollouts [s]")
 
     def problems(self) -> Iterator[Problem]:
         if self.step >= self.horizon:
@@ -202,7 +199,7 @@ class SearchConfig(Settings):
         default="joint", description="one search over all, or weights inside designs"
     )
     population: int = Field(default=128, ge=SMALLEST_POPULATION, description="candidates in a generation [-]")
-    generations: int = Field(default=60, ge=1, description="generations of the search, the outer ones when nested [-]")
+    generations: int = Field(default=60, ge=1, description="generations; each evaluates the whole population, also when nested [-]")
     sigma: float = Field(default=0.3, gt=0, le=1, description="initial step size in the unit box [-]")
     seed: int = Field(default=0, ge=0, lt=2**32, description="of all random numbers [-]")
     chunk: int = Field(default=32, ge=1, description="candidates solved together, which bounds the memory [-]")

@@ -19,7 +19,7 @@ from rtcd_jax.config import FunnelConfig
 from rtcd_jax.numerics import sampling
 from rtcd_jax.numerics.ellipsoid import Ellipsoids
 
-SAFETY = 0.99
+SAFETY = 0.98
 """Level over that of the lowest fresh state that failed."""
 
 
@@ -35,12 +35,17 @@ class Dynamics:
 
 @dataclasses.dataclass(frozen=True)
 class Effort:
-    """How thoroughly a funnel is sampled: passes of fresh states at most, and whether these are followed to the goal."""
+    """How thoroughly a funnel is sampled.
+
+    `passes` of directions behind the coarse one, `rounds` of fresh states at most, and whether these are followed to
+    the goal in the end.
+    """
 
     funnel: FunnelConfig
     dynamics: Dynamics
+    passes: int
     rounds: int
-    follow: bool = False
+    follow: bool
 
 
 class _Confirmed(NamedTuple):
@@ -80,33 +85,51 @@ def follow(problem, candidate, policy, sets: Ellipsoids, tracked, levels, key, e
     """Levels [K] and trials [K] after fresh states of all knots were followed to the goal, by the closed form.
 
     A state fails if it leaves the funnel at a later knot, leaves the boxes, or does not come closer to the goal (by its
-    V) over the horizon after t_N. Only the level at which it started shrinks.
+    V) over the horizon after t_N. Wherever a path leaves the funnel, the level from which it left is the one to shrink:
+    paths of many knots run together, into corners that states uniform in that knot's ellipsoid hardly visit.
     """
     count, goal = effort.funnel.trials, effort.funnel.goal
     dynamics = rollout.closed_form(problem.plant)
     knots = levels.shape[0]
+    born = np.repeat(np.arange(knots), count)[None]
+    last = sets.part(slice(-1, None))
 
     def one_pass(levels, key):
-        begun = _fresh(sets, levels, key, count)
-        flat = begun.reshape(begun.shape[0], 1, -1)  # every state is in the same interval at the same time
+        fresh = _fresh(sets, levels, key, count)
+        flat = fresh.reshape(fresh.shape[0], 1, -1)  # every state is in the same interval at the same time
 
-        def interval(carry, k):
-            x, held = carry
-            here, after = k + np.arange(1), k + 1 + np.arange(1)
-            ends, inside = rollout.roll_intervals(problem, candidate, tracked.part(here), x, dynamics)
-            fine = inside & (sets.part(after).level(ends) <= levels[k + 1])
-            running = jnp.repeat(jnp.arange(knots) <= k, count)[None]
-            return (jnp.where(running, ends, x), held & (fine | ~running)), None
+        def interval(x, k):
+            ends, inside = rollout.roll_intervals(problem, candidate, tracked.part(k + np.arange(1)), x, dynamics)
+            started = born <= k
+            return jnp.where(started, ends, x), (sets.part(k + np.arange(1)).level(x), inside, started)
 
-        (x, held), _ = jax.lax.scan(interval, (flat, jnp.ones(flat.shape[1:], bool)), jnp.arange(knots - 1))
-        gain, last = policy.gains[-1], sets.part(slice(-1, None))
-        ends, inside = rollout.roll_at_goal(problem, candidate, gain, x, dynamics, goal.horizon, goal.step)
-        failed = ~(held & inside & (last.level(ends) < last.level(x))).reshape(knots, count)
-        lowest = jnp.min(jnp.where(failed, sets.level(begun), jnp.inf), 1)
-        return jnp.minimum(levels, SAFETY * lowest), jnp.sum(failed, 1)
+        x, path = jax.lax.scan(interval, flat, jnp.arange(knots - 1))
+        ends, inside = rollout.roll_at_goal(
+            problem, candidate, policy.gains[-1], x, dynamics, goal.horizon, goal.step
+        )
+        arrives = inside & (last.level(ends) < last.level(x))
+        final = _below(levels[-1], last.level(x), ~arrives)
+
+        def backward(carry, knot):
+            target, after, failed = carry
+            level, (here, inside, started) = knot
+            left = started & ~(inside & (after <= target))
+            shrunk = _below(level, here, left)
+            return (shrunk, here, failed | left), shrunk
+
+        (_, _, failed), shrunk = jax.lax.scan(
+            backward, (final, last.level(x), ~arrives), (levels[:-1], path), reverse=True
+        )
+        return jnp.append(shrunk, final), jnp.sum(failed.reshape(knots, count), 1)
 
     done = _repeat(one_pass, levels, key, effort.rounds)
     return done.levels, jnp.where(done.failures == 0, count, 0).astype(jnp.int32)
+
+
+def _below(level, values, failed):
+    """The level, or less than the lowest value that failed below it."""
+    lowest = jnp.min(jnp.where(failed & (values <= level), values, jnp.inf))
+    return jnp.minimum(level, SAFETY * lowest)
 
 
 def _repeat(one_pass: Callable, levels, key, rounds: int) -> _Confirmed:
@@ -131,8 +154,7 @@ def _shrink(levels, starts, ends, inside):
     def backward(target, knot):
         level, starts, ends, inside = knot
         failed = ~(inside & (ends <= target))
-        lowest = jnp.min(jnp.where(failed, starts, jnp.inf))
-        shrunk = jnp.minimum(level, SAFETY * lowest)
+        shrunk = _below(level, starts, failed)
         return shrunk, (shrunk, jnp.sum(failed))
 
     _, (shrunk, failures) = jax.lax.scan(backward, levels[-1], (levels[:-1], starts, ends, inside), reverse=True)

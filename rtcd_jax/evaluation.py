@@ -22,9 +22,6 @@ from rtcd_jax.trajectory import plan
 from rtcd_jax.types import Candidate, Evaluation, Trajectory
 from rtcd_jax.volume import funnel_volume
 
-SEARCH_ROUNDS = 2
-ELITE_ROUNDS = 40
-
 Evaluate = Callable[[jax.Array, jax.Array], Evaluation]
 
 
@@ -34,7 +31,7 @@ def search_effort(problem: Problem) -> Effort:
     share = rollout.mjx(problem.plant) if funnel.rollouts == "mixed" else None
     use = rollout.mjx if funnel.rollouts == "mjx" else rollout.closed_form
     physics = use(problem.plant)
-    return Effort(funnel, Dynamics(physics, physics, physics, share), SEARCH_ROUNDS)
+    return Effort(funnel, Dynamics(physics, physics, physics, share), passes=1, rounds=2, follow=False)
 
 
 def elite_effort(problem: Problem) -> Effort:
@@ -47,7 +44,7 @@ def elite_effort(problem: Problem) -> Effort:
     use = rollout.closed_form if config.funnel.rollouts == "closed_form" else rollout.mjx
     physics = use(problem.plant)
     funnel = config.funnel.model_copy(update=counts)
-    return Effort(funnel, Dynamics(physics, physics, physics), ELITE_ROUNDS, follow=True)
+    return Effort(funnel, Dynamics(physics, physics, physics), passes=3, rounds=40, follow=True)
 
 
 def make_evaluate(problem: Problem, effort: Effort | None = None) -> Evaluate:

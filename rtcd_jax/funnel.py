@@ -3,8 +3,8 @@
     rho_k = sup {rho : every sampled x with V_k(x) <= rho stays inside the boxes and ends with V_{k+1} <= rho_{k+1}}
 
 (paper, section II-D.2, by simulation). Where a state ends after one interval does not depend on any level: all knots and
-samples are rolled out at once, and one cheap backward scan then sets every level. A coarse pass over the whole box and a
-fine one about its result are followed by fresh independent states (confirmation.py). rho_N comes from long rollouts
+samples are rolled out at once, and one cheap backward scan then sets every level. A coarse pass over the whole box and
+finer ones about its result are followed by fresh independent states (confirmation.py). rho_N comes from long rollouts
 under the goal's LQR.
 """
 
@@ -23,9 +23,12 @@ COARSE_DIRECTIONS = 16
 COARSE_DECADES = 3.0
 """The first pass looks at radii from the box's down to a thousandth of it: a millionth of its level."""
 
-FINE_WINDOW = (0.7, 1.3)
-FINE_RADII = 4
-"""Radii of the second pass over those that the first one found."""
+WINDOWS = (1.35, 1.1, 1.02)
+WINDOW_RADII = 4
+"""Later passes look at so many radii between the last pass' divided and multiplied by a window: `Effort.passes` of them."""
+
+MARGIN = 1e-3
+"""Share of every level that is given away for the directions between the sampled ones."""
 
 
 def estimate_funnel(problem: Problem, candidate: Candidate, policy: Policy, key, effort: Effort) -> Funnel:
@@ -51,9 +54,11 @@ def estimate_funnel(problem: Problem, candidate: Candidate, policy: Policy, key,
 
     n = problem.plant.n
     coarse = boxes[:-1, None] * np.logspace(-COARSE_DECADES, 0, effort.funnel.radii)
-    found = pass_over(coarse, sampling.directions(keys[1], COARSE_DIRECTIONS, n, dtype))
-    fine = jnp.minimum(jnp.sqrt(found)[:, None] * np.geomspace(*FINE_WINDOW, FINE_RADII), boxes[:-1, None])
-    levels = pass_over(fine, sampling.directions(keys[2], effort.funnel.directions, n, dtype))
+    levels = pass_over(coarse, sampling.directions(keys[1], COARSE_DIRECTIONS, n, dtype))
+    for index, window in enumerate(WINDOWS[: effort.passes]):
+        near = jnp.sqrt(levels)[:, None] * np.geomspace(1 / window, window, WINDOW_RADII)
+        aims = sampling.directions(jax.random.fold_in(keys[2], index), effort.funnel.directions, n, dtype)
+        levels = pass_over(jnp.minimum(near, boxes[:-1, None]), aims)
 
     levels, trials = confirm(problem, candidate, sets, tracked, jnp.append(levels, last), keys[3], effort)
     if effort.follow:
@@ -88,9 +93,9 @@ def _goal_level(problem, candidate, policy, goal_set: Ellipsoids, box, key, effo
     coarse = box * np.logspace(-COARSE_DECADES, 0, goal.radii)
     crossing = pass_over(coarse, COARSE_DIRECTIONS, key)
     index = jnp.maximum(jnp.searchsorted(coarse, crossing, side="right") - 1, 0)
-    low, high = FINE_WINDOW[0] * coarse[index], coarse[jnp.minimum(index + 1, goal.radii - 1)]
+    low, high = coarse[index] / WINDOWS[0], coarse[jnp.minimum(index + 1, goal.radii - 1)]
     fine = low * (high / low) ** np.linspace(0, 1, goal.radii)
-    return pass_over(fine, goal.directions, jax.random.fold_in(key, 1)) ** 2
+    return (1 - MARGIN) * pass_over(fine, goal.directions, jax.random.fold_in(key, 1)) ** 2
 
 
 def _scan_rays(radii, ends, inside, last):
@@ -101,7 +106,7 @@ def _scan_rays(radii, ends, inside, last):
         # Where no radius of a ray is good: V ~ r^2 from the lowest one, if the boxes at least held there.
         lowest = jnp.where(inside[:, 0], radii[:, 0] * jnp.sqrt(jnp.minimum(target / ends[:, 0], 1.0)), 0.0)
         crossings = _crossings(radii, ends, inside, target)
-        level = jnp.min(jnp.where(crossings > 0, crossings, lowest)) ** 2
+        level = (1 - MARGIN) * jnp.min(jnp.where(crossings > 0, crossings, lowest)) ** 2
         return level, level
 
     _, levels = jax.lax.scan(backward, last, (radii, ends, inside), reverse=True)

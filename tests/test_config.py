@@ -108,7 +108,7 @@ REFUSED = {
         {"funnel.mjx_share": 0},
         "funnel.mjx_share = 0.0: must be > 0 when rollouts = 'mixed', or choose 'closed_form'",
     ),
-    "goal's step": ({"funnel.goal.step": 8}, "funnel.goal.step = 8.0: must be < horizon = 8"),
+    "goal's step": ({"funnel.goal.step": 8}, "funnel.goal.step = 8.0: must be < horizon = 2"),
     "indivisible population": (
         {"search": {"mode": "nested", "population": 100}},
         "search.population = 100: must be a multiple of nested.designs = 8",
@@ -155,7 +155,6 @@ ENDS = [
     ("funnel.confidence", 0.999999, 1),
     ("funnel.goal.directions", 1, 0),
     ("funnel.goal.radii", 2, 1),
-    ("funnel.goal.rounds", 1, 0),
     ("funnel.goal.horizon", 0.03, 0.02),
     ("funnel.goal.step", 1e-9, 0),
     ("search.population", 4, 3),

@@ -17,12 +17,14 @@ LAYERS = (
     {"plants"},
     {"problem"},
     {"population", "trajectory", "policy", "rollout"},
+    {"confirmation"},
     {"funnel", "volume"},
-    {"evaluation"},
+    {"evaluation", "results"},
     {"cmaes", "elites", "loops"},
     {"search"},
     {"storage"},
-    {"run", "verify", "options", "certificate", "report"},
+    {"verify", "options", "certificate", "report"},
+    {"run"},
     {"cli"},
 )
 

@@ -1,0 +1,123 @@
+"""A whole run: config -> search -> elites evaluated again -> run folder. Stops and resumes at any generation."""
+
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+
+from rtcd_jax import search
+from rtcd_jax.config import Config
+from rtcd_jax.console import Console, Progress
+from rtcd_jax.errors import UserError
+from rtcd_jax.evaluation import Evaluate, elite_effort, make_evaluate, spread
+from rtcd_jax.population import initial_genome
+from rtcd_jax.problem import Problem, make_problem
+from rtcd_jax.report import draw_convergence, draw_funnels
+from rtcd_jax.results import arrays_of, record_of
+from rtcd_jax.storage import RunFolder, elite_names
+from rtcd_jax.types import Evaluation, Status
+
+
+def optimize(config: Config, folder: Path, console: Console) -> None:
+    """Search as `config` says and leave everything in the run folder; goes on where an earlier call stopped.
+
+    Raises:
+        UserError: the folder belongs to something else, or nothing at all is feasible.
+    """
+    problem = make_problem(config)
+    evaluate = spread(make_evaluate(problem), jax.devices())
+    plan = search.Plan(config.search, config.elites, tuple(initial_genome(problem).tolist()), problem.design_dims)
+    with RunFolder.open(folder, config) as run:
+        genomes = jnp.zeros((config.search.population, len(problem.free)))
+        begun = run.restore(search.start(plan, jax.eval_shape(evaluate, genomes, jax.random.key(0))))
+        done = int(begun.generation)
+        if done == config.search.generations and elite_names(folder):
+            console.message(f"{folder} is complete: {done} generations, {len(elite_names(folder))} elites")
+            return
+        if done:
+            console.message(f"{folder}: going on after generation {done}")
+        state = begun
+        clock = time.monotonic()
+        for state, generation in search.run(plan, evaluate, begun):
+            run.append(vars(generation))
+            run.save_if_due(state, int(state.generation))
+            console.progress(_progress(config, generation, done, time.monotonic() - clock))
+        run.save(state, int(state.generation))
+        _finish(problem, plan, state, run, console)
+
+
+def _progress(config: Config, generation: search.Generation, begun: int, elapsed: float) -> Progress:
+    here = generation.index + 1 - begun
+    return Progress(
+        generation=generation.index + 1,
+        generations=config.search.generations,
+        best=generation.best_so_far,
+        median=generation.median,
+        feasible=generation.feasible,
+        rate=here * config.search.population / elapsed,
+        elapsed=elapsed,
+        left=elapsed / here * (config.search.generations - generation.index - 1),
+        failures={name: count for name, count in generation.counts.items() if name != Status.OK.name},
+    )
+
+
+def _finish(problem: Problem, plan: search.Plan, state: search.SearchState, run: RunFolder, console: Console) -> None:
+    """Evaluate the elites and the initial candidate again, with more samples and fresh directions, and store them."""
+    effort = elite_effort(problem)
+    again = _one_by_one(spread(make_evaluate(problem, effort), jax.devices()[:1]), console)
+    first = jnp.asarray(initial_genome(problem))
+    reference: list[Evaluation] = []
+
+    def reevaluate(genomes, key) -> Evaluation:
+        filled = int(state.elites.count)
+        evaluations = again(jnp.concatenate([genomes[:filled], first[None]]), key)
+        reference.append(jax.tree.map(lambda leaf: leaf[-1], evaluations))
+        rows = jnp.minimum(jnp.arange(len(genomes)), filled)
+        return jax.tree.map(lambda leaf: leaf[rows], evaluations)
+
+    elites = search.finish(plan, reevaluate, state)
+    count = int(elites.count)
+    if not count:
+        raise UserError(
+            f"none of the {int(state.elites.count)} elites kept a funnel under its second evaluation: "
+            f"raise funnel.directions or funnel.trials, so that the search is not misled by luck"
+        )
+    best_first = [jax.tree.map(lambda leaf, k=k: leaf[k], elites.evaluation) for k in range(count)]
+    run.write_initial(arrays_of(problem, reference[0]), record_of(problem, effort, reference[0]))
+    run.write_elites((arrays_of(problem, found), record_of(problem, effort, found)) for found in best_first)
+    pictures = [*draw_funnels(run.path), *draw_convergence(run.path)]
+    for line in _summary(problem, reference[0], best_first[0]):
+        console.message(line)
+    console.message(f"{count} elites and {len(pictures)} figures in {run.path}")
+
+
+def _one_by_one(evaluate: Evaluate, console: Console) -> Evaluate:
+    """One compiled program for one candidate, so that the elites' number does not matter, with a line for each."""
+
+    def each(genomes, key) -> Evaluation:
+        found = []
+        for index, genome in enumerate(genomes):
+            found.append(jax.block_until_ready(evaluate(genome[None], key)))
+            console.message(f"evaluated again: {index + 1} of {len(genomes)}")
+        return jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *found)
+
+    return each
+
+
+def _summary(problem: Problem, initial: Evaluation, best: Evaluation) -> Iterator[str]:
+    """The volumes of the initial and the best candidate with their ratios, and what the best one is."""
+    yield f"{'volume (sampled)':20}{'initial':>12}{'best':>12}{'ratio':>9}"
+    for label, name in (("sum", "total"), *((name,) * 2 for name in ("integral", "inlet", "geometric_mean"))):
+        before, after = float(getattr(initial.volumes, name)), float(getattr(best.volumes, name))
+        ratio = f"{after / before:9.2f}" if before > 0 else f"{'-':>9}"
+        yield f"{label:20}{before:12.5g}{after:12.5g}{ratio}"
+    if int(initial.status) != Status.OK:
+        yield f"the initial candidate has no funnel: {Status(int(initial.status)).message}"
+    design = ", ".join(
+        f"{name} {float(getattr(best.candidate.design, name)):.4g} {unit}"
+        for name, unit in problem.plant.design_units.items()
+    )
+    weights = ", ".join(f"{value:.4g}" for value in (*best.candidate.q.tolist(), *best.candidate.r.tolist()))
+    yield f"best: {design}; diagonals of Q and R: {weights}"
