@@ -30,7 +30,7 @@ def half_widths(factor):
 
 
 class Ellipsoids(NamedTuple):
-    """A row of sets {x : (x - center)' S (x - center) <= rho}, with K of them on the last axis; `factors` L, S = L L'."""
+    """K sets {x : (x - center)' S (x - center) <= rho} on the last axis; `values` are S, `factors` L with S = L L'."""
 
     centers: Float[Array, "n K"]
     values: Float[Array, "n n K"]
@@ -45,7 +45,7 @@ class Ellipsoids(NamedTuple):
         return Ellipsoids(*(leaf[..., which] for leaf in self))
 
     def points(self, radii, y):
-        """x [n K ...] with V(x) = (radii |y|)^2, for radii [K ...] and y [n ...] or [n K ...]."""
+        """x [n K ...] with V(x) = (radii |y|)^2, for radii [K ...] and y that broadcasts to [n K ...]."""
         y = jnp.broadcast_to(y, (y.shape[0], *radii.shape))
         return _behind(self.centers, radii.ndim - 1) + from_ball(_behind(self.factors, radii.ndim - 1), radii * y)
 

@@ -41,6 +41,9 @@ class Settings(NamedTuple):
     filter_size: int = 48
 
 
+DEFAULTS = Settings()
+
+
 class ControlProblem(NamedTuple):
     """What to solve. `stage(x, u, h, parameters) -> (next x, cost)` works elementwise on trailing axes.
 
@@ -294,9 +297,13 @@ class _Solver:
         length = search.length
         xs, us, h = it.xs + length * step.dxs, it.us + length * step.dus, it.h + length * step.dh
         duals = jax.tree.map(
-            lambda dual, d, slack: jnp.clip(dual + longest_dual * d, it.barrier / 1e10 / slack, 1e10 * it.barrier / slack),
-            it.duals, dual_step, self.slacks(self.values(xs, us, h)),
-        )  # fmt: skip  # (16)
+            lambda dual, d, slack: jnp.clip(
+                dual + longest_dual * d, it.barrier / 1e10 / slack, 1e10 * it.barrier / slack
+            ),
+            it.duals,
+            dual_step,
+            self.slacks(self.values(xs, us, h)),
+        )  # (16)
         point = it._replace(
             xs=xs, us=us, h=h, duals=duals, defects=search.defects, cost=search.cost,
             multipliers=it.multipliers + length * (step.multipliers - it.multipliers),
@@ -423,7 +430,7 @@ def _regularize(it: _Iterate, s: Settings, search: _Search):
     return jnp.minimum(jnp.where(search.forced, now, jnp.where(search.taken, changed, up)), 1e8)
 
 
-def solve(problem: ControlProblem, parameters, guesses: Guess, settings: Settings = Settings()) -> Solution:
+def solve(problem: ControlProblem, parameters, guesses: Guess, settings: Settings = DEFAULTS) -> Solution:
     """Solve every problem of the batch from every guess; the batch is the last axis.
 
     `parameters` is a pytree with P on the last axis of every leaf, `guesses` holds G guesses; the solutions come

@@ -99,10 +99,7 @@ def solve(problem: Subproblem, floor: float = 1e-12) -> Step:
     start = jnp.zeros((n, batch), dtype)
     _, (dxs, dus) = jax.lax.scan(roll, start, (gains, offsets, gains_end, problem.jacobians, problem.defects))
     multipliers = (
-        jnp.sum(rows[:, :, :n] * dxs[:, None], 2)
-        + rows[:, :, n] * dh
-        + slopes
-        + jnp.sum(ends * nu[None, :, None], 1)
+        jnp.sum(rows[:, :, :n] * dxs[:, None], 2) + rows[:, :, n] * dh + slopes + jnp.sum(ends * nu[None, :, None], 1)
     )
     return Step(jnp.concatenate([start[None], dxs]), dus, dh, multipliers, convex)
 
@@ -111,9 +108,7 @@ def _solve_first_knot(first: _Value, problem: Subproblem, floor: float):
     """dh and nu from stationarity in both: the 2 x 2 block system eliminated through W."""
     n = first.end.shape[0]
     by_step = first.end[:, n]
-    solution, independent = spd_solve(
-        first.end_curvature, jnp.stack([by_step, first.end_offset], 1), floor
-    )
+    solution, independent = spd_solve(first.end_curvature, jnp.stack([by_step, first.end_offset], 1), floor)
     pivot = first.quadratic[n, n] + problem.curvature + jnp.sum(by_step * solution[:, 0], 0)
     convex = first.convex & independent & (pivot > floor)
     residual = -first.linear[n] - problem.slope - jnp.sum(by_step * solution[:, 1], 0)

@@ -81,7 +81,7 @@ def short_interval(a, spread, cost, duration) -> Interval:
     q3 = mm(at, q2) + mm(q2, a) - 2 * mm(cost, gq)
     g3 = mm(a, g2) + mm(g2, at) - 2 * mm(spread, qg)
     a2 = mm(a, a) - gq
-    a3 = mm(a, a2) - mm(g2, cost) - mm(spread, mm(cost, a))
+    a3 = mm(a, a2) - mm(g2, cost) - 2 * mm(gq, a)
     t, tt, ttt = duration, duration**2 / 2, duration**3 / 6
     return Interval(
         transition=_identity(a) + t * a + tt * a2 + ttt * a3,
@@ -93,10 +93,11 @@ def short_interval(a, spread, cost, duration) -> Interval:
 
 def constant_interval(a, spread, cost, duration, doublings: int) -> Interval:
     """The flow of constant A, G, Q over `duration`, from 2^doublings equal short intervals."""
-    interval = short_interval(a, spread, cost, duration / 2**doublings)
-    for _ in range(doublings):
-        interval = compose(interval, interval)
-    return interval
+    return _double(short_interval(a, spread, cost, duration / 2**doublings), doublings)
+
+
+def _double(interval: Interval, times: int) -> Interval:
+    return jax.lax.fori_loop(0, times, lambda _, interval: compose(interval, interval), interval)
 
 
 def infinite_horizon(a, spread, cost, doublings: int = 48):
@@ -107,11 +108,7 @@ def infinite_horizon(a, spread, cost, doublings: int = 48):
     norm = jnp.sqrt(jnp.sum(spread**2, (0, 1)) * jnp.sum(cost**2, (0, 1))) ** 0.5
     fastest = norm + jnp.sqrt(jnp.sum(a**2, (0, 1)))
     interval = short_interval(a, spread, cost, 2e-4 / fastest)
-
-    def double(_, interval):
-        return compose(interval, interval)
-
-    interval = jax.lax.fori_loop(0, doublings, double, interval)
+    interval = _double(interval, doublings)
     value = interval.cost
     residual = mtm(a, value) + mm(value, a) - mm(value, mm(spread, value)) + cost
     scale = jnp.max(jnp.abs(cost), (0, 1)) + jnp.max(jnp.abs(mtm(a, value)), (0, 1))

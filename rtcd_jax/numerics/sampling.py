@@ -19,7 +19,7 @@ def quasi_uniform(key, count: int, dimensions: int, dtype):
 
 
 def directions(key, count: int, n: int, dtype):
-    """`count` well spread unit vectors [n count]; evenly spaced for n = 2, both directions for n = 1."""
+    """`count` well spread unit vectors [n count]; evenly spaced for n = 2; for n = 1 three of them point both ways."""
     if n == 2:
         turn = 2 * np.pi * (jnp.arange(count, dtype=dtype) + jax.random.uniform(key, (), dtype)) / count
         return jnp.stack([jnp.cos(turn), jnp.sin(turn)])
