@@ -25,10 +25,9 @@ SAFETY = 0.98
 
 @dataclasses.dataclass(frozen=True)
 class Dynamics:
-    """Whose physics the directions, the rollouts at the goal and the fresh states feel; `share` a part of these."""
+    """Whose physics the directions and the fresh states feel; `share` a part of these. Coarse passes are closed form."""
 
     directions: rollout.Dynamics
-    goal: rollout.Dynamics
     fresh: rollout.Dynamics
     share: rollout.Dynamics | None = None
 

@@ -19,7 +19,7 @@ from rtcd_jax.policy import stabilize
 from rtcd_jax.population import decode
 from rtcd_jax.problem import Problem
 from rtcd_jax.trajectory import plan
-from rtcd_jax.types import Candidate, Evaluation, Trajectory
+from rtcd_jax.types import Candidate, Evaluation, Policy, Trajectory
 from rtcd_jax.volume import funnel_volume
 
 Evaluate = Callable[[jax.Array, jax.Array], Evaluation]
@@ -31,7 +31,7 @@ def search_effort(problem: Problem) -> Effort:
     share = rollout.mjx(problem.plant) if funnel.rollouts == "mixed" else None
     use = rollout.mjx if funnel.rollouts == "mjx" else rollout.closed_form
     physics = use(problem.plant)
-    return Effort(funnel, Dynamics(physics, physics, physics, share), passes=1, rounds=2, follow=False)
+    return Effort(funnel, Dynamics(physics, physics, share), passes=1, rounds=2, follow=False)
 
 
 def elite_effort(problem: Problem) -> Effort:
@@ -44,7 +44,7 @@ def elite_effort(problem: Problem) -> Effort:
     use = rollout.closed_form if config.funnel.rollouts == "closed_form" else rollout.mjx
     physics = use(problem.plant)
     funnel = config.funnel.model_copy(update=counts)
-    return Effort(funnel, Dynamics(physics, physics, physics), passes=3, rounds=40, follow=True)
+    return Effort(funnel, Dynamics(physics, physics), passes=3, rounds=40, follow=True)
 
 
 def make_evaluate(problem: Problem, effort: Effort | None = None) -> Evaluate:
@@ -82,8 +82,17 @@ def spread(evaluate: Evaluate, devices: list[jax.Device]) -> Evaluate:
     return on_all
 
 
+def resample(problem: Problem, effort: Effort, evaluation: Evaluation, key) -> Evaluation:
+    """One candidate's evaluation with its funnel estimated anew about the same policy."""
+    return _with_funnel(problem, effort, key, evaluation.genome, evaluation.candidate, evaluation.funnel.policy)
+
+
 def _assess(problem: Problem, effort: Effort, key, planned: tuple[jax.Array, Candidate, Trajectory]) -> Evaluation:
     genome, candidate, trajectory = planned
     policy = stabilize(problem, candidate, trajectory)
+    return _with_funnel(problem, effort, key, genome, candidate, policy)
+
+
+def _with_funnel(problem: Problem, effort: Effort, key, genome, candidate: Candidate, policy: Policy) -> Evaluation:
     funnel = estimate_funnel(problem, candidate, policy, key, effort)
     return Evaluation(genome, candidate, funnel, funnel_volume(funnel), funnel.status)

@@ -45,20 +45,25 @@ def estimate_funnel(problem: Problem, candidate: Candidate, policy: Policy, key,
     tracked = rollout.reference(problem, candidate, policy, effort.funnel.steps)
     last = _goal_level(problem, candidate, policy, sets.part(slice(-1, None)), boxes[-1], keys[0], effort)
 
-    def pass_over(radii, directions):
+    def pass_over(radii, directions, dynamics):
         """Levels from the rays through `directions` [n D] with ascending `radii` [N J]."""
         grid = jnp.broadcast_to(radii[:, None, :], (radii.shape[0], directions.shape[1], radii.shape[1]))
         x = sets.part(slice(0, -1)).points(grid, directions[:, None, :, None])
-        ends, inside = rollout.roll_intervals(problem, candidate, tracked, x, effort.dynamics.directions)
+        ends, inside = rollout.roll_intervals(problem, candidate, tracked, x, dynamics)
         return _scan_rays(grid, sets.part(slice(1, None)).level(ends), inside, last)
+
+    def closer(levels, pass_):
+        window, key = pass_
+        near = jnp.sqrt(levels)[:, None] * window ** np.linspace(-1, 1, WINDOW_RADII)
+        aims = sampling.directions(key, effort.funnel.directions, n, dtype)
+        return pass_over(jnp.minimum(near, boxes[:-1, None]), aims, effort.dynamics.directions), None
 
     n = problem.plant.n
     coarse = boxes[:-1, None] * np.logspace(-COARSE_DECADES, 0, effort.funnel.radii)
-    levels = pass_over(coarse, sampling.directions(keys[1], COARSE_DIRECTIONS, n, dtype))
-    for index, window in enumerate(WINDOWS[: effort.passes]):
-        near = jnp.sqrt(levels)[:, None] * np.geomspace(1 / window, window, WINDOW_RADII)
-        aims = sampling.directions(jax.random.fold_in(keys[2], index), effort.funnel.directions, n, dtype)
-        levels = pass_over(jnp.minimum(near, boxes[:-1, None]), aims)
+    aims = sampling.directions(keys[1], COARSE_DIRECTIONS, n, dtype)
+    levels = pass_over(coarse, aims, rollout.closed_form(problem.plant))
+    windows = jnp.asarray(WINDOWS[: effort.passes], dtype)
+    levels, _ = jax.lax.scan(closer, levels, (windows, jax.random.split(keys[2], effort.passes)))
 
     levels, trials = confirm(problem, candidate, sets, tracked, jnp.append(levels, last), keys[3], effort)
     if effort.follow:
@@ -81,21 +86,21 @@ def _goal_level(problem, candidate, policy, goal_set: Ellipsoids, box, key, effo
     """
     goal, gain = effort.funnel.goal, policy.gains[-1]
 
-    def pass_over(radii, count, key):
+    def pass_over(radii, count, key, dynamics):
         directions = sampling.directions(key, count, problem.plant.n, box.dtype)
         grid = jnp.broadcast_to(radii, (count, radii.shape[0]))
         x = goal_set.points(grid[None], directions[:, None, :, None])
-        dynamics = effort.dynamics.goal
         ends, inside = rollout.roll_at_goal(problem, candidate, gain, x, dynamics, goal.horizon, goal.step)
         return jnp.min(_crossings(grid, goal_set.level(ends)[0] / grid**2, inside[0], 1.0))
 
     # Far out the rollouts diverge so steeply that only the bracket of the first pass can be relied on, no crossing.
     coarse = box * np.logspace(-COARSE_DECADES, 0, goal.radii)
-    crossing = pass_over(coarse, COARSE_DIRECTIONS, key)
+    crossing = pass_over(coarse, COARSE_DIRECTIONS, key, rollout.closed_form(problem.plant))
     index = jnp.maximum(jnp.searchsorted(coarse, crossing, side="right") - 1, 0)
     low, high = coarse[index] / WINDOWS[0], coarse[jnp.minimum(index + 1, goal.radii - 1)]
     fine = low * (high / low) ** np.linspace(0, 1, goal.radii)
-    return (1 - MARGIN) * pass_over(fine, goal.directions, jax.random.fold_in(key, 1)) ** 2
+    key = jax.random.fold_in(key, 1)
+    return (1 - MARGIN) * pass_over(fine, goal.directions, key, effort.dynamics.directions) ** 2
 
 
 def _scan_rays(radii, ends, inside, last):

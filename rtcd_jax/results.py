@@ -30,11 +30,11 @@ def arrays_of(problem: Problem, evaluation: Evaluation) -> dict[str, np.ndarray]
         "K_goal": policy.gains[-1],
         "x_goal": problem.goal,
         "u_max": problem.input_limits,
-        "volume_per_knot": volumes.per_knot,
-        "volume_sum": volumes.total,
-        "volume_integral": volumes.integral,
-        "volume_inlet": volumes.inlet,
-        "volume_geometric_mean": volumes.geometric_mean,
+        "volumes_per_knot": volumes.per_knot,
+        "volumes_sum": volumes.total,
+        "volumes_integral": volumes.integral,
+        "volumes_inlet": volumes.inlet,
+        "volumes_geometric_mean": volumes.geometric_mean,
         "genome": host.genome,
     }
 

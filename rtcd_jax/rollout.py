@@ -20,13 +20,16 @@ from rtcd_jax.policy import nominal
 from rtcd_jax.problem import Problem
 from rtcd_jax.types import Candidate, Policy
 
-Dynamics = Callable
-"""(design, x [n ...], u [m ...]) -> x' [n ...]."""
+class Dynamics(NamedTuple):
+    """`rate(design, x [n ...], u [m ...]) -> x' [n ...]`; a `large` program is compiled once a step, not once a stage."""
+
+    rate: Callable
+    large: bool
 
 
 def closed_form(plant: Plant) -> Dynamics:
     """The plant's own equations."""
-    return plant.dynamics
+    return Dynamics(plant.dynamics, large=False)
 
 
 def mjx(plant: Plant) -> Dynamics:
@@ -35,12 +38,12 @@ def mjx(plant: Plant) -> Dynamics:
 
     stepper = MjxStepper(plant)
 
-    def dynamics(design, x, u):
+    def rate(design, x, u):
         over_states = jax.vmap(partial(stepper.dynamics, design), in_axes=-1, out_axes=-1)
         flat = over_states(x.reshape(plant.n, -1), u.reshape(plant.m, -1))
         return flat.reshape(x.shape)
 
-    return dynamics
+    return Dynamics(rate, large=True)
 
 
 class Reference(NamedTuple):
@@ -89,9 +92,9 @@ def roll_intervals(problem: Problem, candidate: Candidate, tracked: Reference, x
         def rate(x, point):
             error = x - align(states[point])
             u = jnp.clip(feedforward - mv(align(gains[point]), error), -bounds, bounds)
-            return dynamics(candidate.design, x, u)
+            return dynamics.rate(candidate.design, x, u)
 
-        x = _rk4_of_time(rate, x, tracked.step)
+        x = _rk4_of_time(rate, x, tracked.step, dynamics.large)
         return (x, inside & jnp.all(jnp.abs(x) <= limits, 0)), None
 
     inside = jnp.all(jnp.abs(x) <= limits, 0)
@@ -105,23 +108,38 @@ def roll_at_goal(problem: Problem, candidate: Candidate, gain, x, dynamics: Dyna
     gain = _align(gain, x.ndim - 1)
 
     def rate(x, _):
-        return dynamics(candidate.design, x, jnp.clip(-mv(gain, x - goal), -bounds, bounds))
+        return dynamics.rate(candidate.design, x, jnp.clip(-mv(gain, x - goal), -bounds, bounds))
 
     def advance(_, carry):
         x, inside = carry
-        x = _rk4_of_time(rate, x, step)
+        x = _rk4_of_time(rate, x, step, dynamics.large)
         return x, inside & jnp.all(jnp.abs(x) <= limits, 0)
 
     return jax.lax.fori_loop(0, round(duration / step), advance, (x, jnp.all(jnp.abs(x) <= limits, 0)))
 
 
-def _rk4_of_time(rate, x, dt):
-    """A Runge-Kutta step of x' = rate(x, point) with the data of the step's start (0), middle (1) and end (2)."""
-    k1 = rate(x, 0)
-    k2 = rate(x + 0.5 * dt * k1, 1)
-    k3 = rate(x + 0.5 * dt * k2, 1)
-    k4 = rate(x + dt * k3, 2)
-    return x + dt / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
+def _rk4_of_time(rate, x, dt, looped: bool):
+    """A Runge-Kutta step of x' = rate(x, point) with the data of the step's start (0), middle (1) and end (2).
+
+    `looped` evaluates `rate` in a loop over the stages, so that it stands in the program once.
+    """
+    if not looped:
+        k1 = rate(x, 0)
+        k2 = rate(x + 0.5 * dt * k1, 1)
+        k3 = rate(x + 0.5 * dt * k2, 1)
+        k4 = rate(x + dt * k3, 2)
+        return x + dt / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
+
+    def stage(carry, tableau):
+        slope, total = carry
+        node, point, weight = tableau
+        slope = rate(x + node * dt * slope, point)
+        return (slope, total + weight * slope), None
+
+    nodes, points, weights = np.array([0, 0.5, 0.5, 1]), np.array([0, 1, 1, 2]), np.array([1, 2, 2, 1]) / 6
+    zero = jnp.zeros_like(x)
+    (_, total), _ = jax.lax.scan(stage, (zero, zero), (nodes.astype(x.dtype), points, weights.astype(x.dtype)))
+    return x + dt * total
 
 
 def _align(a, behind: int):

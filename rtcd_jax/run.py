@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 
 import jax
@@ -11,7 +12,7 @@ from rtcd_jax import search
 from rtcd_jax.config import Config
 from rtcd_jax.console import Console, Progress
 from rtcd_jax.errors import UserError
-from rtcd_jax.evaluation import Evaluate, elite_effort, make_evaluate, spread
+from rtcd_jax.evaluation import Evaluate, elite_effort, make_evaluate, resample, spread
 from rtcd_jax.population import initial_genome
 from rtcd_jax.problem import Problem, make_problem
 from rtcd_jax.report import draw_convergence, draw_funnels
@@ -45,7 +46,7 @@ def optimize(config: Config, folder: Path, console: Console) -> None:
             run.save_if_due(state, int(state.generation))
             console.progress(_progress(config, generation, done, time.monotonic() - clock))
         run.save(state, int(state.generation))
-        _finish(problem, plan, state, run, console)
+        _finish(problem, plan, evaluate, state, run, console)
 
 
 def _progress(config: Config, generation: search.Generation, begun: int, elapsed: float) -> Progress:
@@ -63,47 +64,44 @@ def _progress(config: Config, generation: search.Generation, begun: int, elapsed
     )
 
 
-def _finish(problem: Problem, plan: search.Plan, state: search.SearchState, run: RunFolder, console: Console) -> None:
-    """Evaluate the elites and the initial candidate again, with more samples and fresh directions, and store them."""
+def _finish(
+    problem: Problem, plan: search.Plan, evaluate: Evaluate, state: search.SearchState, run: RunFolder, console: Console
+) -> None:
+    """Sample the funnels of the elites and the initial candidate again, more thoroughly, and store everything."""
     effort = elite_effort(problem)
-    again = _one_by_one(spread(make_evaluate(problem, effort), jax.devices()[:1]), console)
-    first = jnp.asarray(initial_genome(problem))
-    reference: list[Evaluation] = []
+    again = jax.jit(partial(resample, problem, effort))
+    elites = state.elites
+    filled = int(elites.count)
+    first = jnp.tile(jnp.asarray(initial_genome(problem)), (plan.settings.population, 1))
+
+    def sampled(index: int, evaluation: Evaluation, key) -> Evaluation:
+        found = jax.block_until_ready(again(evaluation, key))
+        console.message(f"funnel sampled again: {index + 1} of {filled + 1}")
+        return found
 
     def reevaluate(genomes, key) -> Evaluation:
-        filled = int(state.elites.count)
-        evaluations = again(jnp.concatenate([genomes[:filled], first[None]]), key)
-        reference.append(jax.tree.map(lambda leaf: leaf[-1], evaluations))
-        rows = jnp.minimum(jnp.arange(len(genomes)), filled)
-        return jax.tree.map(lambda leaf: leaf[rows], evaluations)
+        found = [sampled(k, _row(elites.evaluation, k), key) for k in range(filled)]
+        found += [found[-1]] * (len(genomes) - filled)
+        return jax.tree.map(lambda *leaves: jnp.stack(leaves), *found)
 
-    elites = search.finish(plan, reevaluate, state)
-    count = int(elites.count)
-    if not count:
+    finished = search.finish(plan, reevaluate, state)
+    initial = sampled(filled, _row(evaluate(first, jax.random.key(0)), 0), jax.random.key(plan.settings.seed))
+    if not int(finished.count):
         raise UserError(
-            f"none of the {int(state.elites.count)} elites kept a funnel under its second evaluation: "
-            f"raise funnel.directions or funnel.trials, so that the search is not misled by luck"
+            f"none of the {filled} elites kept a funnel under more samples: raise funnel.directions or funnel.trials, "
+            "so that the search is not misled by luck"
         )
-    best_first = [jax.tree.map(lambda leaf, k=k: leaf[k], elites.evaluation) for k in range(count)]
-    run.write_initial(arrays_of(problem, reference[0]), record_of(problem, effort, reference[0]))
+    best_first = [_row(finished.evaluation, k) for k in range(int(finished.count))]
+    run.write_initial(arrays_of(problem, initial), record_of(problem, effort, initial))
     run.write_elites((arrays_of(problem, found), record_of(problem, effort, found)) for found in best_first)
     pictures = [*draw_funnels(run.path), *draw_convergence(run.path)]
-    for line in _summary(problem, reference[0], best_first[0]):
+    for line in _summary(problem, initial, best_first[0]):
         console.message(line)
-    console.message(f"{count} elites and {len(pictures)} figures in {run.path}")
+    console.message(f"{len(best_first)} elites and {len(pictures)} figures in {run.path}")
 
 
-def _one_by_one(evaluate: Evaluate, console: Console) -> Evaluate:
-    """One compiled program for one candidate, so that the elites' number does not matter, with a line for each."""
-
-    def each(genomes, key) -> Evaluation:
-        found = []
-        for index, genome in enumerate(genomes):
-            found.append(jax.block_until_ready(evaluate(genome[None], key)))
-            console.message(f"evaluated again: {index + 1} of {len(genomes)}")
-        return jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *found)
-
-    return each
+def _row(evaluation: Evaluation, index: int) -> Evaluation:
+    return jax.tree.map(lambda leaf: leaf[index], evaluation)
 
 
 def _summary(problem: Problem, initial: Evaluation, best: Evaluation) -> Iterator[str]:
