@@ -37,7 +37,7 @@ class Nominal(NamedTuple):
     def at(self, shares):
         """x* [n N T] at fractions `shares` [T] of every interval."""
         ends = (self.starts, self.start_rates, self.ends, self.end_rates)
-        return cubic_hermite(shares, self.dt, *(leaf[:, :, None] for leaf in ends))
+        return cubic_hermite(jnp.asarray(shares, self.dt.dtype), self.dt, *(leaf[:, :, None] for leaf in ends))
 
 
 def nominal(problem: Problem, candidate: Candidate, trajectory: Trajectory) -> Nominal:

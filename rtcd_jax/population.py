@@ -3,6 +3,8 @@
 Designs are scaled linearly, weights logarithmically; pinned variables have no dimension.
 """
 
+from math import log
+
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -36,11 +38,11 @@ def initial_genome(problem: Problem) -> np.ndarray:
 
 def _from_unit(variable: Variable, share):
     if variable.logarithmic:
-        return jnp.exp(np.log(variable.low) + share * np.log(variable.high / variable.low))
+        return jnp.exp(log(variable.low) + share * log(variable.high / variable.low))
     return variable.low + share * (variable.high - variable.low)
 
 
 def _to_unit(variable: Variable, value: float) -> float:
     if variable.logarithmic:
-        return float(np.log(value / variable.low) / np.log(variable.high / variable.low))
+        return log(value / variable.low) / log(variable.high / variable.low)
     return (value - variable.low) / (variable.high - variable.low)

@@ -101,7 +101,9 @@ def solve(problem: Subproblem, floor: float = 1e-12) -> Step:
     multipliers = (
         jnp.sum(rows[:, :, :n] * dxs[:, None], 2) + rows[:, :, n] * dh + slopes + jnp.sum(ends * nu[None, :, None], 1)
     )
-    return Step(jnp.concatenate([start[None], dxs]), dus, dh, multipliers, convex)
+    # The sweep meets the pinned end up to rounding, which would add up over the iterations.
+    pinned = jnp.concatenate([start[None], dxs[:-1], start[None]])
+    return Step(pinned, dus, dh, multipliers, convex)
 
 
 def _solve_first_knot(first: _Value, problem: Subproblem, floor: float):

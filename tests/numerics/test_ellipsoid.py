@@ -77,7 +77,7 @@ def test_points_of_a_row_lie_on_the_levels_they_were_asked_for():
     np.testing.assert_allclose(row.level(x), radii**2 * np.sum(y**2, 0), rtol=1e-10, atol=1e-12)
     for k in range(4):
         error = x[:, k, 2, 3] - row.centers[:, k]
-        assert float(row.level(x)[k, 2, 3]) == pytest.approx(error @ row.values[:, :, k] @ error, rel=1e-12)
+        assert float(row.level(x)[k, 2, 3]) == pytest.approx(float(error @ row.values[:, :, k] @ error), rel=1e-12)
 
 
 def test_a_part_is_the_row_cut():

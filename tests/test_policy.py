@@ -1,0 +1,219 @@
+"""The time-varying LQR against scipy's Riccati solvers along the same motion."""
+
+import dataclasses
+from functools import partial
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.linalg
+from scipy.integrate import solve_ivp
+from scipy.interpolate import CubicHermiteSpline
+
+from rtcd_jax.config import load
+from rtcd_jax.plants.pendulum import PendulumDesign
+from rtcd_jax.policy import linearize, nominal, stabilize
+from rtcd_jax.problem import make_problem
+from rtcd_jax.trajectory import plan
+from rtcd_jax.types import Candidate, Status
+
+CONFIG = Path(__file__).parent.parent / "configs" / "pendulum_rtcd.yaml"
+
+# The paper's initial candidate, the stiffest corner of the box, its softest, and two between.
+MASS, LENGTH = np.array([0.7, 0.6, 0.8, 0.65, 0.75]), np.array([0.4, 0.4, 0.6, 0.5, 0.45])
+Q = np.array([[10.0, 1.0], [10.0, 10.0], [1.0, 1.0], [3.0, 2.0], [2.0, 8.0]])
+R = np.array([[0.1], [0.001], [10.0], [1.0], [0.01]])
+STIFF, SOFT = 1, 2
+
+
+def take(tree, row):
+    return jax.tree.map(lambda leaf: leaf[row], tree)
+
+
+@pytest.fixture(scope="module")
+def problem():
+    return make_problem(load(CONFIG))
+
+
+@pytest.fixture(scope="module")
+def candidates():
+    return Candidate(PendulumDesign(jnp.asarray(MASS), jnp.asarray(LENGTH)), jnp.asarray(Q), jnp.asarray(R))
+
+
+@pytest.fixture(scope="module")
+def planned(problem, candidates):
+    return jax.jit(partial(plan, problem))(candidates)
+
+
+@pytest.fixture(scope="module")
+def track(problem):
+    return jax.jit(jax.vmap(partial(stabilize, problem)))
+
+
+@pytest.fixture(scope="module")
+def policies(track, candidates, planned):
+    return track(candidates, planned)
+
+
+class Pendulum:
+    """The linearization of candidate `row` by hand."""
+
+    def __init__(self, plant, row):
+        self.inertia = MASS[row] * LENGTH[row] ** 2
+        self.damping, self.stiffness = plant.damping, MASS[row] * plant.gravity * LENGTH[row]
+        self.b = np.array([[0.0], [1 / self.inertia]])
+
+    def a(self, theta):
+        return np.array([[0.0, 1.0], [-self.stiffness * np.cos(theta) / self.inertia, -self.damping / self.inertia]])
+
+    def rate(self, x, u):
+        torque = u - self.damping * x[:, 1] - self.stiffness * np.sin(x[:, 0])
+        return np.stack([x[:, 1], torque / self.inertia], 1)
+
+
+def test_every_candidate_has_a_policy(policies):
+    np.testing.assert_array_equal(policies.status, Status.OK)
+
+
+def test_values_are_symmetric_positive_definite_at_every_knot(policies):
+    """The stiff candidate as well: its closed loop has poles that no explicit step of this size survives."""
+    values = np.asarray(policies.values)
+    np.testing.assert_array_equal(values, np.swapaxes(values, -1, -2))
+    assert np.all(np.linalg.eigvalsh(values)[..., 0] > 0)
+    assert np.max(np.abs(policies.gains[STIFF])) > 100
+
+
+def test_the_last_value_is_the_goals_algebraic_riccati_solution(problem, policies):
+    for row in range(len(MASS)):
+        model = Pendulum(problem.plant, row)
+        exact = scipy.linalg.solve_continuous_are(model.a(np.pi), model.b, np.diag(Q[row]), np.diag(R[row]))
+        np.testing.assert_allclose(policies.values[row, -1], exact, rtol=1e-8)
+
+
+def test_gains_are_r_inverse_b_transposed_s(problem, policies):
+    for row in range(len(MASS)):
+        b = Pendulum(problem.plant, row).b
+        expected = np.einsum("mn,knj->kmj", b.T / R[row], policies.values[row])
+        np.testing.assert_allclose(policies.gains[row], expected, rtol=1e-12)
+
+
+def riccati_by_radau(problem, trajectory, row):
+    """S(t_k) [N+1 n n] by an implicit integrator on the Hermite nominal, from scipy's algebraic solution."""
+    model, q, r_inverse = Pendulum(problem.plant, row), np.diag(Q[row]), 1 / R[row, 0]
+    spread = r_inverse * model.b @ model.b.T
+    xs, us, dt = (np.asarray(leaf) for leaf in (trajectory.xs, trajectory.us[:, 0], trajectory.dt))
+    start_rates, end_rates = model.rate(xs[:-1], us), model.rate(xs[1:], us)
+    values = [scipy.linalg.solve_continuous_are(model.a(np.pi), model.b, q, np.diag(R[row]))]
+    for k in reversed(range(len(us))):
+        theta = CubicHermiteSpline([0, dt], xs[k : k + 2, 0], [start_rates[k, 0], end_rates[k, 0]])
+
+        def backward(t, flat, theta=theta):
+            s, a = flat.reshape(2, 2), model.a(theta(dt - t))
+            return (a.T @ s + s @ a - s @ spread @ s + q).ravel()
+
+        flow = solve_ivp(backward, (0, dt), values[-1].ravel(), method="Radau", rtol=1e-9, atol=1e-10)
+        values.append(flow.y[:, -1].reshape(2, 2))
+    return np.array(values[::-1])
+
+
+def errors(values, exact):
+    """Largest error of a knot's value matrix over its largest entry, for every knot."""
+    return np.max(np.abs(values - exact), (1, 2)) / np.max(np.abs(exact), (1, 2))
+
+
+@pytest.mark.parametrize(("row", "tolerance"), [(0, 3e-5), (STIFF, 2e-6), (SOFT, 2e-3), (3, 2e-4)])
+def test_values_solve_the_riccati_equation_along_the_motion(problem, planned, policies, row, tolerance):
+    """A and B are held over a fifth of an interval: slow motions have the longest intervals and the largest error."""
+    exact = riccati_by_radau(problem, take(planned, row), row)
+    assert np.max(errors(policies.values[row], exact)) < tolerance
+
+
+def test_the_error_of_the_values_falls_with_the_square_of_the_substep(problem, candidates, planned, policies):
+    config = problem.config
+    finer = config.trajectory.model_copy(update={"substeps": 2 * config.trajectory.substeps})
+    halved = dataclasses.replace(problem, config=config.model_copy(update={"trajectory": finer}))
+    values = jax.jit(partial(stabilize, halved))(take(candidates, SOFT), take(planned, SOFT)).values
+    exact = riccati_by_radau(problem, take(planned, SOFT), SOFT)
+    ratio = np.max(errors(policies.values[SOFT], exact)) / np.max(errors(values, exact))
+    assert ratio == pytest.approx(4, rel=0.1)
+
+
+def test_the_linearization_is_the_one_by_hand(problem, candidates):
+    x = jnp.asarray(np.random.default_rng(0).normal(size=(2, 5)))
+    u = jnp.zeros((1, 5))
+    for row in range(len(MASS)):
+        model = Pendulum(problem.plant, row)
+        a, b = linearize(problem, take(candidates, row), x, u)
+        for k in range(5):
+            np.testing.assert_allclose(a[..., k], model.a(float(x[0, k])), rtol=1e-12, atol=1e-12)
+            np.testing.assert_allclose(b[..., k], model.b, rtol=1e-12)
+
+
+def test_the_nominal_motion_meets_knots_and_nearly_solves_the_dynamics(problem, candidates, planned):
+    """Between the knots the interpolant's error is of fourth order in dt."""
+    candidate, trajectory = take(candidates, 0), take(planned, 0)
+    motion = nominal(problem, candidate, trajectory)
+    at = motion.at(jnp.array([0.0, 0.5, 1.0]))
+    np.testing.assert_array_equal(at[..., 0].T, trajectory.xs[:-1])
+    np.testing.assert_array_equal(at[..., 2].T, trajectory.xs[1:])
+    half = solve_ivp(
+        lambda _, x: Pendulum(problem.plant, 0).rate(x[None], float(trajectory.us[20, 0]))[0],
+        (0, float(trajectory.dt) / 2),
+        trajectory.xs[20],
+        rtol=1e-10,
+    ).y[:, -1]
+    np.testing.assert_allclose(at[:, 20, 1], half, atol=1e-3)
+
+
+def test_vmapped_is_one_by_one(problem, candidates, planned, policies):
+    alone = jax.jit(partial(stabilize, problem))
+    for row in range(len(MASS)):
+        policy = alone(take(candidates, row), take(planned, row))
+        np.testing.assert_allclose(policy.values, policies.values[row], rtol=1e-10)
+        np.testing.assert_allclose(policy.gains, policies.gains[row], rtol=1e-10)
+
+
+def test_a_broken_candidate_leaves_the_others_bit_equal(track, candidates, planned, policies):
+    broken = dataclasses.replace(candidates, q=candidates.q.at[2, 1].set(jnp.nan))
+    beside = track(broken, planned)
+    assert beside.status[2] == Status.RICCATI_INDEFINITE
+    for row in (0, 1, 3, 4):
+        np.testing.assert_array_equal(beside.values[row], policies.values[row])
+        np.testing.assert_array_equal(beside.gains[row], policies.gains[row])
+
+
+class Unactuated:
+    """The pendulum with a motor that is not connected: its upright rest cannot be stabilized."""
+
+    n, m = 2, 1
+
+    def __init__(self, plant):
+        self.plant = plant
+
+    def dynamics(self, design, x, u):
+        return self.plant.dynamics(design, x, 0 * u)
+
+
+def test_what_cannot_be_stabilized_is_indefinite(problem, candidates, planned):
+    loose = dataclasses.replace(problem, plant=Unactuated(problem.plant))
+    policy = jax.jit(partial(stabilize, loose))(take(candidates, 0), take(planned, 0))
+    assert policy.status == Status.RICCATI_INDEFINITE
+
+
+def test_the_first_failure_is_kept(track, candidates, planned):
+    failed = dataclasses.replace(planned, status=jnp.full(5, Status.TRAJECTORY_NOT_SOLVED, jnp.int32))
+    broken = dataclasses.replace(candidates, q=candidates.q.at[2, 1].set(jnp.nan))
+    np.testing.assert_array_equal(track(broken, failed).status, Status.TRAJECTORY_NOT_SOLVED)
+
+
+@pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
+def test_dtype_and_shapes_are_kept(problem, candidates, planned, dtype):
+    def cast(leaf):
+        floating = jnp.issubdtype(leaf.dtype, jnp.floating)
+        return jax.ShapeDtypeStruct(leaf.shape[1:], dtype if floating else leaf.dtype)
+
+    policy = jax.eval_shape(partial(stabilize, problem), *jax.tree.map(cast, (candidates, planned)))
+    assert policy.values == jax.ShapeDtypeStruct((51, 2, 2), dtype)
+    assert policy.gains == jax.ShapeDtypeStruct((51, 1, 2), dtype)
