@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from rtcd_jax.numerics.batched import mv
+from rtcd_jax.numerics.integrate import END, MIDDLE, START, rk4_varying_step, split
 from rtcd_jax.plants.base import Plant
 from rtcd_jax.policy import nominal
 from rtcd_jax.problem import Problem
@@ -80,8 +80,7 @@ def roll_intervals(problem: Problem, candidate: Candidate, tracked: Reference, x
 
     `x` [n N ...] are states at the intervals' starts.
     """
-    limits = _column(problem.state_limits, x)
-    bounds = _column(problem.input_limits, x)
+    limits, bounds = problem.state_limits, _column(problem.input_limits, x)
     align = partial(_align, behind=x.ndim - 2)
     feedforward = align(tracked.inputs)
 
@@ -89,57 +88,67 @@ def roll_intervals(problem: Problem, candidate: Candidate, tracked: Reference, x
         x, inside = carry
         states, gains = stage
 
-        def rate(x, point):
-            error = x - align(states[point])
-            u = jnp.clip(feedforward - mv(align(gains[point]), error), -bounds, bounds)
-            return dynamics.rate(candidate.design, x, u)
+        def slope(x, place):
+            error = [a - align(b) for a, b in zip(x, states[place], strict=True)]
+            u = jnp.clip(feedforward - _feedback(align(gains[place]), error), -bounds, bounds)
+            return split(dynamics.rate(candidate.design, jnp.stack(x), u))
 
-        x = _rk4_of_time(rate, x, tracked.step, dynamics.large)
-        return (x, inside & jnp.all(jnp.abs(x) <= limits, 0)), None
+        x = _step(slope, x, tracked.step, dynamics.large)
+        return (x, inside & _within(x, limits)), None
 
-    inside = jnp.all(jnp.abs(x) <= limits, 0)
-    (x, inside), _ = jax.lax.scan(step, (x, inside), (tracked.states, tracked.gains))
-    return x, inside
+    x = split(x)
+    (x, inside), _ = jax.lax.scan(step, (x, _within(x, limits)), (tracked.states, tracked.gains))
+    return jnp.stack(x), inside
 
 
 def roll_at_goal(problem: Problem, candidate: Candidate, gain, x, dynamics: Dynamics, duration: float, step: float):
     """End states [n ...] after `duration` [s] under the goal's LQR, and whether the boxes on x held on the way [...]."""
-    goal, limits, bounds = (_column(a, x) for a in (problem.goal, problem.state_limits, problem.input_limits))
+    limits, bounds = problem.state_limits, _column(problem.input_limits, x)
     gain = _align(gain, x.ndim - 1)
 
-    def rate(x, _):
-        return dynamics.rate(candidate.design, x, jnp.clip(-mv(gain, x - goal), -bounds, bounds))
+    def slope(x, _):
+        error = [a - b for a, b in zip(x, problem.goal.astype(x[0].dtype), strict=True)]
+        return split(dynamics.rate(candidate.design, jnp.stack(x), jnp.clip(-_feedback(gain, error), -bounds, bounds)))
 
     def advance(_, carry):
         x, inside = carry
-        x = _rk4_of_time(rate, x, step, dynamics.large)
-        return x, inside & jnp.all(jnp.abs(x) <= limits, 0)
+        x = _step(slope, x, step, dynamics.large)
+        return x, inside & _within(x, limits)
 
-    return jax.lax.fori_loop(0, round(duration / step), advance, (x, jnp.all(jnp.abs(x) <= limits, 0)))
+    x = split(x)
+    x, inside = jax.lax.fori_loop(0, round(duration / step), advance, (x, _within(x, limits)))
+    return jnp.stack(x), inside
 
 
-def _rk4_of_time(rate, x, dt, looped: bool):
-    """A Runge-Kutta step of x' = rate(x, point) with the data of the step's start (0), middle (1) and end (2).
+def _feedback(gain, error):
+    """K e [m ...] for components e."""
+    return sum(gain[:, i] * e for i, e in enumerate(error))
 
-    `looped` evaluates `rate` in a loop over the stages, so that it stands in the program once.
-    """
+
+def _within(x, limits: np.ndarray):
+    inside = jnp.ones(x[0].shape, bool)
+    for component, limit in zip(x, limits, strict=True):
+        if np.isfinite(limit):
+            inside = inside & (jnp.abs(component) <= limit)
+    return inside
+
+
+def _step(slope, x, dt, looped: bool):
+    """A Runge-Kutta step; `looped` takes the stages in a loop, so that `slope` stands in the program once."""
     if not looped:
-        k1 = rate(x, 0)
-        k2 = rate(x + 0.5 * dt * k1, 1)
-        k3 = rate(x + 0.5 * dt * k2, 1)
-        k4 = rate(x + dt * k3, 2)
-        return x + dt / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
+        return rk4_varying_step(slope, x, dt)
 
     def stage(carry, tableau):
-        slope, total = carry
-        node, point, weight = tableau
-        slope = rate(x + node * dt * slope, point)
-        return (slope, total + weight * slope), None
+        k, total = carry
+        node, place, weight = tableau
+        k = slope(tuple(a + node * dt * b for a, b in zip(x, k, strict=True)), place)
+        return (k, tuple(a + weight * b for a, b in zip(total, k, strict=True))), None
 
-    nodes, points, weights = np.array([0, 0.5, 0.5, 1]), np.array([0, 1, 1, 2]), np.array([1, 2, 2, 1]) / 6
-    zero = jnp.zeros_like(x)
-    (_, total), _ = jax.lax.scan(stage, (zero, zero), (nodes.astype(x.dtype), points, weights.astype(x.dtype)))
-    return x + dt * total
+    dtype = x[0].dtype
+    nodes, weights = np.array([0, 0.5, 0.5, 1], dtype), np.array([1, 2, 2, 1], dtype) / 6
+    zero = tuple(jnp.zeros_like(a) for a in x)
+    (_, total), _ = jax.lax.scan(stage, (zero, zero), (nodes, np.array([START, MIDDLE, MIDDLE, END]), weights))
+    return tuple(a + dt * b for a, b in zip(x, total, strict=True))
 
 
 def _align(a, behind: int):

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from rtcd_jax.numerics import interior_point
-from rtcd_jax.numerics.integrate import rk4
+from rtcd_jax.numerics.integrate import componentwise, rk4, split
 from rtcd_jax.problem import Problem
 from rtcd_jax.types import Candidate, Status, Trajectory
 
@@ -47,7 +47,8 @@ def plan(problem: Problem, candidates: Candidate) -> Trajectory:
 
 def interval_map(problem: Problem, candidate: Candidate, x, u, h, substeps: int):
     """Phi(x, u, h), elementwise over the axes behind the first."""
-    return rk4(partial(problem.plant.dynamics, candidate.design), x, u, h, substeps)
+    dynamics = componentwise(partial(problem.plant.dynamics, candidate.design))
+    return jnp.stack(rk4(dynamics, split(x), u, h, substeps))
 
 
 def _stage(problem: Problem, substeps: int, x, u, h, candidate: Candidate):

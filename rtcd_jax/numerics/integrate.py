@@ -1,19 +1,48 @@
-"""Explicit Runge-Kutta integration of x' = f(x, u) with the input held."""
+"""The classical fourth-order Runge-Kutta step. States are arrays or pytrees of arrays.
+
+A state as a tuple of its components, `split(x)`, makes the faster program on a CPU: XLA fuses arithmetic on components
+into one pass over the batch, but stops at every concatenation of components to one array.
+"""
 
 from collections.abc import Callable
 
+import jax
+import jax.numpy as jnp
+
+START, MIDDLE, END = 0, 1, 2
+"""Where in the step a slope is taken."""
+
+
+def split(x):
+    """The components of x [n ...] as a tuple of n arrays [...]."""
+    return tuple(x[i] for i in range(x.shape[0]))
+
+
+def componentwise(f: Callable) -> Callable:
+    """f(x [n ...], ...) -> x' [n ...] as a function of tuples of components."""
+    return lambda parts, *rest: split(f(jnp.stack(parts), *rest))
+
+
+def rk4_varying_step(slope: Callable, x, dt):
+    """x(t + dt) for x' = slope(x, place), `place` being START, MIDDLE or END of the step."""
+    k1 = slope(x, START)
+    k2 = slope(_along(x, 0.5 * dt, k1), MIDDLE)
+    k3 = slope(_along(x, 0.5 * dt, k2), MIDDLE)
+    k4 = slope(_along(x, dt, k3), END)
+    return jax.tree.map(lambda x, a, b, c, d: x + dt / 6 * (a + 2 * b + 2 * c + d), x, k1, k2, k3, k4)
+
 
 def rk4_step(f: Callable, x, u, dt):
-    """x(t + dt) by the classical fourth-order Runge-Kutta step; any shapes that `f` accepts."""
-    k1 = f(x, u)
-    k2 = f(x + 0.5 * dt * k1, u)
-    k3 = f(x + 0.5 * dt * k2, u)
-    k4 = f(x + dt * k3, u)
-    return x + dt / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
+    """x(t + dt) for x' = f(x, u), the input held."""
+    return rk4_varying_step(lambda x, _: f(x, u), x, dt)
 
 
 def rk4(f: Callable, x, u, duration, steps: int):
-    """x(t + duration) by equal Runge-Kutta steps."""
+    """x(t + duration) by equal Runge-Kutta steps, the input held."""
     for _ in range(steps):
         x = rk4_step(f, x, u, duration / steps)
     return x
+
+
+def _along(x, distance, slope):
+    return jax.tree.map(lambda x, k: x + distance * k, x, slope)
