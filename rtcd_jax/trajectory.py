@@ -15,9 +15,17 @@ import jax.numpy as jnp
 import numpy as np
 
 from rtcd_jax.numerics import interior_point
+from rtcd_jax.numerics.derivatives import jacobian
 from rtcd_jax.numerics.integrate import componentwise, rk4, split
+from rtcd_jax.population import decode, initial_genome
 from rtcd_jax.problem import Problem
 from rtcd_jax.types import Candidate, Status, Trajectory
+
+SWING = 0.4
+"""Amplitude of the starting guesses' swings over the distance from start to goal."""
+
+RESOLVED_RATE = 1e-3
+"""Oscillations below this [rad/s] are roundings of eigenvalues that are real."""
 
 
 def plan(problem: Problem, candidates: Candidate) -> Trajectory:
@@ -53,7 +61,7 @@ def interval_map(problem: Problem, candidate: Candidate, x, u, h, substeps: int)
 
 def _stage(problem: Problem, substeps: int, x, u, h, candidate: Candidate):
     """One interval's end and cost for x [n N P], u [m N P], h [P]."""
-    error = x - problem.goal[:, None, None]
+    error = x - jnp.asarray(problem.goal, x.dtype)[:, None, None]
     q, r = candidate.q[:, None], candidate.r[:, None]
     running = 0.5 * (jnp.sum(q * error**2, 0) + jnp.sum(r * u**2, 0))
     cost = h * (running + problem.config.trajectory.time_weight)
@@ -61,10 +69,12 @@ def _stage(problem: Problem, substeps: int, x, u, h, candidate: Candidate):
 
 
 def _cheapest(solution: interior_point.Solution, family: int) -> Trajectory:
-    solved = solution.solved.reshape(-1, family)
-    # An unsolved candidate shows the start that came closest.
-    rank = jnp.where(solved, solution.cost.reshape(-1, family), 1e30 + solution.defect.reshape(-1, family))
-    best = jnp.argmin(rank, 1) + family * jnp.arange(solved.shape[0])
+    solved, cost, defect = (
+        leaf.reshape(-1, family) for leaf in (solution.solved, solution.cost, solution.defect)
+    )
+    cheapest = jnp.argmin(jnp.where(solved, cost, jnp.inf), 1)
+    closest = jnp.argmin(jnp.where(jnp.isnan(defect), jnp.inf, defect), 1)  # what an unsolved candidate shows
+    best = jnp.where(jnp.any(solved, 1), cheapest, closest) + family * jnp.arange(solved.shape[0])
     chosen = jax.tree.map(lambda leaf: jnp.moveaxis(leaf[..., best], -1, 0), solution)
     return Trajectory(
         us=chosen.us,
@@ -78,24 +88,39 @@ def _cheapest(solution: interior_point.Solution, family: int) -> Trajectory:
 
 
 def starts(problem: Problem, dtype) -> interior_point.Guess:
-    """The family of starting guesses: rest, then swing to and fro into the goal.
+    """The family of starting guesses: swing to and fro about the start, then into the goal, in a short and a long time.
 
-    Which one ends best depends on how many swings the candidate needs; the straight line of the paper's code is poor.
+    Which one ends best depends on how many swings the candidate needs. They are motions, no solutions of the dynamics:
+    rolling the dynamics out under a sinusoidal input and bending the end into the goal needs four times the iterations,
+    and the straight line of the paper's code often fails.
     """
-    family = [_swing(problem, swings, share) for swings, share in ((2, 0.55), (3, 0.55))]
+    step = problem.config.trajectory.step
+    pace = _slowest_oscillation(problem) / (2 * np.pi)
+    family = []
+    for share in (0.25, 0.5):
+        h = step.min + share * (step.max - step.min)
+        family.append(_swing(problem, max(2, int(problem.intervals * h * pace)), h))
     return interior_point.Guess(*(jnp.asarray(np.stack(leaves, -1), dtype) for leaves in zip(*family, strict=True)))
 
 
-def _swing(problem: Problem, swings: int, share: float):
-    """Positions move smoothly in the second half of the time; `share` places h between its limits."""
+def _slowest_oscillation(problem: Problem) -> float:
+    """Of the initial design about the start, without input [rad/s]; 0 if it does not oscillate."""
+    plant = problem.plant
+    with jax.ensure_compile_time_eval():  # the starts are constants of the compiled program
+        design = decode(problem, jnp.asarray(initial_genome(problem))).design
+        slopes = jacobian(lambda x: plant.dynamics(design, x, jnp.zeros(plant.m)), jnp.asarray(problem.start))
+        rates = np.abs(np.linalg.eigvals(np.asarray(slopes)).imag)
+    return float(min(rates[rates > RESOLVED_RATE], default=0.0))
+
+
+def _swing(problem: Problem, swings: int, h: float):
+    """Positions swing `swings` half periods under one arch and, in the second half of the time, move to the goal."""
     n, count = problem.plant.n, problem.intervals
-    step = problem.config.trajectory.step
-    h = step.min + share * (step.max - step.min)
     s = np.linspace(0, 1, count + 1)[:, None]
     late = np.clip(2 * s - 1, 0, 1)
-    travel = problem.goal[: n // 2] - problem.start[: n // 2]
     ease = late**2 * (3 - 2 * late)
-    swing = -np.sin(np.pi * s) * np.sin(swings * np.pi * s)
-    positions = problem.start[: n // 2] + travel * ease + np.sign(travel) * swing
+    swing = np.sin(np.pi * s) * np.sin(swings * np.pi * s)
+    travel = problem.goal[: n // 2] - problem.start[: n // 2]
+    positions = problem.start[: n // 2] + travel * (ease - SWING * swing)
     xs = np.concatenate([positions, np.gradient(positions, h * count * s[:, 0], axis=0)], 1)
     return xs, np.zeros((count, problem.plant.m)), h
