@@ -136,7 +136,7 @@ def _repeat(one_pass: Callable, levels, key, rounds: int) -> _Confirmed:
         levels, failures = one_pass(state.levels, jax.random.fold_in(key, state.round))
         return _Confirmed(levels, failures, jnp.sum(failures) == 0, state.round + 1)
 
-    state = _Confirmed(levels, jnp.zeros(levels.shape, int), jnp.asarray(False), jnp.asarray(0))
+    state = _Confirmed(levels, jnp.ones(levels.shape, int), jnp.asarray(False), jnp.asarray(0))  # nothing tried yet
     return jax.lax.while_loop(lambda state: ~state.clean & (state.round < rounds), again, state)
 
 

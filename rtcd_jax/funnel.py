@@ -133,5 +133,6 @@ def _crossings(radii, ends, inside, target):
 
     r0, v0, r1, v1 = take(radii, below), take(ends, below), take(radii, above), take(ends, above)
     share = jnp.clip(jnp.log(target / v0) / jnp.log(v1 / v0), 0.0, 1.0)
-    between = jnp.where(take(inside, above) & (above > below), r0 * (r1 / r0) ** share, r0)
+    known = take(inside, above) & jnp.isfinite(v1) & (above > below)
+    between = jnp.where(known, r0 * (r1 / r0) ** share, r0)
     return jnp.where(count == 0, 0.0, between)

@@ -1,0 +1,97 @@
+"""Volumes of ellipsoids in closed form, the relations between the four objectives, the published funnels."""
+
+from math import gamma, pi
+from pathlib import Path
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from rtcd_jax.types import Funnel, Policy, Status, Trajectory
+from rtcd_jax.volume import funnel_volume
+
+PUBLISHED = Path(__file__).parents[2] / "shared" / "reference"
+DT = 0.07
+
+
+def _funnel(values, levels, status=Status.OK) -> Funnel:
+    values, levels = jnp.asarray(values, float), jnp.asarray(levels, float)
+    knots, n = values.shape[:2]
+    zero, ok = jnp.zeros(()), jnp.zeros((), jnp.int32)
+    motion = Trajectory(jnp.zeros((knots - 1, 1)), jnp.zeros((knots, n)), jnp.asarray(DT), zero, zero, ok, ok)
+    policy = Policy(motion, jnp.zeros((knots, 1, n)), values, ok)
+    return Funnel(policy, levels, jnp.zeros(knots, jnp.int32), jnp.asarray(status, jnp.int32))
+
+
+def _random_funnel(n: int, knots: int = 7, **changes) -> Funnel:
+    random = np.random.default_rng(n)
+    roots = random.normal(size=(knots, n, n))
+    return _funnel(roots @ np.swapaxes(roots, 1, 2) + np.eye(n), random.uniform(0.1, 5, knots), **changes)
+
+
+@pytest.mark.parametrize("n", [1, 2, 3, 4, 6])
+def test_a_ball_has_the_balls_volume(n):
+    """V = |x|^2 / a^2 <= rho is the ball of radius a sqrt(rho)."""
+    a, rho = 0.3, np.array([0.5, 2.0])
+    volumes = funnel_volume(_funnel(np.tile(np.eye(n) / a**2, (2, 1, 1)), rho))
+    np.testing.assert_allclose(volumes.per_knot, pi ** (n / 2) / gamma(n / 2 + 1) * (a * np.sqrt(rho)) ** n, rtol=1e-13)
+
+
+def test_one_two_and_four_dimensions_by_their_own_formulas():
+    """An interval's length, an ellipse's pi a b, and in four dimensions pi^2 / 2 times the four semi-axes."""
+    axes, rho = np.array([0.5, 2.0, 1.5, 0.1]), 1.7
+    for n, unit in ((1, 2.0), (2, pi), (4, pi**2 / 2)):
+        semi = axes[:n] * np.sqrt(rho)
+        value = np.tile(np.diag(1 / axes[:n] ** 2), (2, 1, 1))
+        np.testing.assert_allclose(funnel_volume(_funnel(value, [rho, rho])).inlet, unit * semi.prod(), rtol=1e-13)
+
+
+@pytest.mark.parametrize("n", [2, 4])
+def test_a_linear_map_scales_volumes_by_its_determinant(n):
+    """x -> T x takes {x' S x <= rho} to {x' T^-T S T^-1 x <= rho}."""
+    funnel = _random_funnel(n)
+    map_ = np.random.default_rng(9).normal(size=(n, n))
+    inverse = np.linalg.inv(map_)
+    mapped = _funnel(inverse.T @ np.asarray(funnel.policy.values) @ inverse, funnel.levels)
+    ratio = funnel_volume(mapped).per_knot / funnel_volume(funnel).per_knot
+    np.testing.assert_allclose(ratio, abs(np.linalg.det(map_)), rtol=1e-10)
+
+
+@pytest.mark.parametrize("n", [1, 2, 4])
+def test_the_four_volumes_follow_from_the_knots(n):
+    volumes = funnel_volume(_random_funnel(n))
+    knots = np.asarray(volumes.per_knot)
+    np.testing.assert_allclose(volumes.total, knots.sum(), rtol=1e-14)
+    np.testing.assert_allclose(volumes.integral, np.trapezoid(knots, dx=DT), rtol=1e-14)
+    np.testing.assert_allclose(volumes.geometric_mean, knots.prod() ** (1 / len(knots)), rtol=1e-13)
+    assert volumes.inlet == knots[0]
+    assert volumes.geometric_mean < volumes.total / len(knots)
+
+
+def test_an_empty_knot_leaves_the_sum_and_kills_the_geometric_mean():
+    whole = _random_funnel(2)
+    levels = whole.levels.at[3].set(0.0)
+    volumes, before = funnel_volume(_funnel(whole.policy.values, levels)), funnel_volume(whole)
+    np.testing.assert_allclose(volumes.total, before.total - before.per_knot[3], rtol=1e-13)
+    assert volumes.geometric_mean == 0
+
+
+@pytest.mark.parametrize("status", [status for status in Status if status != Status.OK])
+def test_a_failed_candidate_has_no_volume(status):
+    """Zero, not NaN, also where its numbers mean nothing."""
+    funnel = _random_funnel(2, status=status)
+    broken = _funnel(funnel.policy.values.at[2].set(jnp.nan), funnel.levels.at[4].set(-1.0), status)
+    for volumes in (funnel_volume(funnel), funnel_volume(broken)):
+        for volume in (*volumes.per_knot, volumes.total, volumes.integral, volumes.inlet, volumes.geometric_mean):
+            assert volume == 0
+
+
+@pytest.mark.skipif(not PUBLISHED.is_dir(), reason="the published funnels are not there")
+@pytest.mark.parametrize(("name", "n", "published"), [("pendulum", 2, 156.9), ("cartpole", 4, 495.6)])
+def test_the_published_initial_funnels_have_their_published_sums(name, n, published):
+    """Four digits of the papers' authors' funnels, evaluated exactly."""
+    rows = np.genfromtxt(PUBLISHED / f"{name}_initial.csv", delimiter=",", names=True)
+    values = np.zeros((len(rows), n, n))
+    for i, j in zip(*np.triu_indices(n), strict=True):
+        values[:, i, j] = values[:, j, i] = rows[f"S{i + 1}{j + 1}"]
+    assert float(funnel_volume(_funnel(values, rows["rho"])).total) == pytest.approx(published, abs=0.051)
