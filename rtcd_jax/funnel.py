@@ -19,13 +19,15 @@ from rtcd_jax.numerics.ellipsoid import Ellipsoids
 from rtcd_jax.problem import Problem
 from rtcd_jax.types import Candidate, Funnel, Policy, Status, first_failure
 
-COARSE_DIRECTIONS = 16
+COARSE_DIRECTIONS = 12
 COARSE_DECADES = 3.0
 """The first pass looks at radii from the box's down to a thousandth of it: a millionth of its level."""
 
 WINDOWS = (1.35, 1.1, 1.02)
 WINDOW_RADII = 4
 """Later passes look at so many radii between the last pass' divided and multiplied by a window: `Effort.passes` of them."""
+
+BRACKET_OVERLAP = 1.05
 
 MARGIN = 1e-3
 """Share of every level that is given away for the directions between the sampled ones."""
@@ -86,21 +88,24 @@ def _goal_level(problem, candidate, policy, goal_set: Ellipsoids, box, key, effo
     """
     goal, gain = effort.funnel.goal, policy.gains[-1]
 
-    def pass_over(radii, count, key, dynamics):
-        directions = sampling.directions(key, count, problem.plant.n, box.dtype)
-        grid = jnp.broadcast_to(radii, (count, radii.shape[0]))
+    def narrow(bracket, key):
+        """Of a ladder of radii over the bracket, the last good one and the one above it, and the crossing between."""
+        low, high, _ = bracket
+        ladder = low * (high / low) ** np.linspace(0, 1, goal.radii)
+        directions = sampling.directions(key, goal.directions, problem.plant.n, box.dtype)
+        grid = jnp.broadcast_to(ladder, (goal.directions, goal.radii))
         x = goal_set.points(grid[None], directions[:, None, :, None])
+        dynamics = effort.dynamics.directions
         ends, inside = rollout.roll_at_goal(problem, candidate, gain, x, dynamics, goal.horizon, goal.step)
-        return jnp.min(_crossings(grid, goal_set.level(ends)[0] / grid**2, inside[0], 1.0))
+        crossing = jnp.min(_crossings(grid, goal_set.level(ends)[0] / grid**2, inside[0], 1.0))
+        index = jnp.clip(jnp.searchsorted(ladder, crossing, side="right") - 1, 0, goal.radii - 2)
+        # The next round's other directions may find less.
+        return (ladder[index] / BRACKET_OVERLAP, ladder[index + 1], crossing), None
 
-    # Far out the rollouts diverge so steeply that only the bracket of the first pass can be relied on, no crossing.
-    coarse = box * np.logspace(-COARSE_DECADES, 0, goal.radii)
-    crossing = pass_over(coarse, COARSE_DIRECTIONS, key, rollout.closed_form(problem.plant))
-    index = jnp.maximum(jnp.searchsorted(coarse, crossing, side="right") - 1, 0)
-    low, high = coarse[index] / WINDOWS[0], coarse[jnp.minimum(index + 1, goal.radii - 1)]
-    fine = low * (high / low) ** np.linspace(0, 1, goal.radii)
-    key = jax.random.fold_in(key, 1)
-    return (1 - MARGIN) * pass_over(fine, goal.directions, key, effort.dynamics.directions) ** 2
+    # Far out the rollouts diverge so steeply that no crossing can be interpolated before the bracket is narrow.
+    start = (box * 10**-COARSE_DECADES, box, box)
+    (_, _, radius), _ = jax.lax.scan(narrow, start, jax.random.split(key, goal.rounds))
+    return (1 - MARGIN) * radius**2
 
 
 def _scan_rays(radii, ends, inside, last):

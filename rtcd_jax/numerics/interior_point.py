@@ -24,7 +24,7 @@ class Settings(NamedTuple):
     """Tolerances and the constants of the method."""
 
     max_iterations: int = 200
-    lanes: int = 64
+    lanes: int = 48
     defect_tolerance: float = 1e-9
     dual_tolerance: float = 1e-4  # relative to 1 + max |multiplier|
     complementarity_tolerance: float = 1e-5  # likewise
