@@ -153,11 +153,11 @@ class TrajectoryConfig(Settings):
 class GoalConfig(Settings):
     """The region of attraction of the goal's LQR, from which the last level follows."""
 
-    directions: int = Field(24, ge=1, description="quasi-random directions about the goal, in each round [-]")
-    radii: int = Field(6, ge=3, description="radii along each direction, in each round [-]")
-    rounds: int = Field(4, ge=1, description="rounds, each between two neighboring radii of the one before [-]")
-    horizon: float = Field(2.0, gt=0, description="time over which a rollout must come closer to the goal [s]")
-    step: float = Field(0.02, gt=0, description="RK4 step of these rollouts [s]")
+    directions: int = Field(default=24, ge=1, description="quasi-random directions about the goal, in each round [-]")
+    radii: int = Field(default=6, ge=3, description="radii along each direction, in each round [-]")
+    rounds: int = Field(default=4, ge=1, description="rounds, each between two neighboring radii of the one before [-]")
+    horizon: float = Field(default=2.0, gt=0, description="time over which a rollout must come closer to the goal [s]")
+    step: float = Field(default=0.02, gt=0, description="RK4 step of these rollouts [s]")
 
     def problems(self) -> Iterator[Problem]:
         if self.step >= self.horizon:
@@ -167,10 +167,10 @@ class GoalConfig(Settings):
 class FunnelConfig(Settings):
     rollouts: Literal["closed_form", "mjx", "mixed"] = Field(default="mixed", description="dynamics of the rollouts")
     mjx_share: float = Field(default=0.01, ge=0, le=1, description="share of the fresh samples on MJX when mixed [-]")
-    directions: int = Field(default=48, ge=1, description="quasi-random directions at each knot [-]")
-    radii: int = Field(default=12, ge=2, description="log-spaced radii along each direction [-]")
-    steps: int = Field(default=8, ge=1, description="RK4 steps of a rollout inside an interval [-]")
-    trials: int = Field(default=64, ge=1, description="fresh uniform states of each final ellipsoid, at each knot [-]")
+    directions: int = Field(default=32, ge=1, description="quasi-random directions at each knot [-]")
+    radii: int = Field(default=10, ge=2, description="log-spaced radii of the first pass along each direction [-]")
+    steps: int = Field(default=5, ge=1, description="RK4 steps of a rollout inside an interval [-]")
+    trials: int = Field(default=32, ge=1, description="fresh uniform states of each ellipsoid, at each knot [-]")
     confidence: float = Field(default=0.99, gt=0, lt=1, description="1 - beta, jointly over the knots [-]")
     goal: GoalConfig = Field(default=GoalConfig(), description="region of attraction of the goal's LQR")
 
@@ -200,7 +200,9 @@ class SearchConfig(Settings):
         default="joint", description="one search over all, or weights inside designs"
     )
     population: int = Field(default=128, ge=SMALLEST_POPULATION, description="candidates in a generation [-]")
-    generations: int = Field(default=60, ge=1, description="generations; each evaluates the whole population, also when nested [-]")
+    generations: int = Field(
+        default=60, ge=1, description="generations; each evaluates the whole population, also when nested [-]"
+    )
     sigma: float = Field(default=0.3, gt=0, le=1, description="initial step size in the unit box [-]")
     seed: int = Field(default=0, ge=0, lt=2**32, description="of all random numbers [-]")
     chunk: int = Field(default=32, ge=1, description="candidates solved together, which bounds the memory [-]")

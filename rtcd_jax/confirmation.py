@@ -25,7 +25,7 @@ SAFETY = 0.98
 
 @dataclasses.dataclass(frozen=True)
 class Dynamics:
-    """Whose physics the directions and the fresh states feel; `share` a part of these. Coarse passes are closed form."""
+    """Whose physics the directions and the fresh states feel; `share` a part of these."""
 
     directions: rollout.Dynamics
     fresh: rollout.Dynamics
@@ -103,9 +103,7 @@ def follow(problem, candidate, policy, sets: Ellipsoids, tracked, levels, key, e
             return jnp.where(started, ends, x), (sets.part(k + np.arange(1)).level(x), inside, started)
 
         x, path = jax.lax.scan(interval, flat, jnp.arange(knots - 1))
-        ends, inside = rollout.roll_at_goal(
-            problem, candidate, policy.gains[-1], x, dynamics, goal.horizon, goal.step
-        )
+        ends, inside = rollout.roll_at_goal(problem, candidate, policy.gains[-1], x, dynamics, goal.horizon, goal.step)
         arrives = inside & (last.level(ends) < last.level(x))
         final = _below(levels[-1], last.level(x), ~arrives)
 

@@ -69,9 +69,7 @@ def spread(evaluate: Evaluate, devices: list[jax.Device]) -> Evaluate:
     mesh = Mesh(np.array(devices), ("candidates",), axis_types=(AxisType.Auto,))
     split, whole = PartitionSpec("candidates"), PartitionSpec()
     # Every device runs loops of its own length: there is nothing to keep in step.
-    shared = jax.jit(
-        jax.shard_map(evaluate, mesh=mesh, in_specs=(split, whole), out_specs=split, check_vma=False)
-    )
+    shared = jax.jit(jax.shard_map(evaluate, mesh=mesh, in_specs=(split, whole), out_specs=split, check_vma=False))
 
     def on_all(genomes, key) -> Evaluation:
         count = genomes.shape[0]

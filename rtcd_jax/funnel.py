@@ -2,10 +2,10 @@
 
     rho_k = sup {rho : every sampled x with V_k(x) <= rho stays inside the boxes and ends with V_{k+1} <= rho_{k+1}}
 
-(paper, section II-D.2, by simulation). Where a state ends after one interval does not depend on any level: all knots and
-samples are rolled out at once, and one cheap backward scan then sets every level. A coarse pass over the whole box and
-finer ones about its result are followed by fresh independent states (confirmation.py). rho_N comes from long rollouts
-under the goal's LQR.
+(paper, section II-D.2, by simulation). Where a state ends after one interval does not depend on any level: all knots
+and samples are rolled out at once, and one cheap backward scan then sets every level. A coarse pass over the whole box
+and finer ones about its result are followed by fresh independent states (confirmation.py). rho_N comes from long
+rollouts under the goal's LQR.
 """
 
 import jax
@@ -25,9 +25,10 @@ COARSE_DECADES = 3.0
 
 WINDOWS = (1.35, 1.1, 1.02)
 WINDOW_RADII = 4
-"""Later passes look at so many radii between the last pass' divided and multiplied by a window: `Effort.passes` of them."""
+"""`Effort.passes` later passes look at so many radii, from the last pass' radius over its window to it times that."""
 
 BRACKET_OVERLAP = 1.05
+"""Radii at the goal: a round starts below the last one's by this, since its other directions may find less."""
 
 MARGIN = 1e-3
 """Share of every level that is given away for the directions between the sampled ones."""
@@ -37,8 +38,8 @@ def estimate_funnel(problem: Problem, candidate: Candidate, policy: Policy, key,
     """The funnel of a policy (*sampled* rung); `key` fixes all directions, radii and fresh states.
 
     `trials[k]` fresh states, independent and uniform in the final B_k, were rolled out without a failure: over their
-    interval or, with `effort.follow`, to the goal. It is zero where the last pass still had to shrink the level. Status:
-    FUNNEL_EMPTY if some level is below the smallest sampled one.
+    interval or, with `effort.follow`, to the goal. It is zero where the last pass still had to shrink the level.
+    Status: FUNNEL_EMPTY if some level is below the smallest sampled one.
     """
     keys = jax.random.split(key, 5)
     sets = Ellipsoids.about(policy.trajectory.xs.T, jnp.moveaxis(policy.values, 0, -1))
@@ -99,7 +100,6 @@ def _goal_level(problem, candidate, policy, goal_set: Ellipsoids, box, key, effo
         ends, inside = rollout.roll_at_goal(problem, candidate, gain, x, dynamics, goal.horizon, goal.step)
         crossing = jnp.min(_crossings(grid, goal_set.level(ends)[0] / grid**2, inside[0], 1.0))
         index = jnp.clip(jnp.searchsorted(ladder, crossing, side="right") - 1, 0, goal.radii - 2)
-        # The next round's other directions may find less.
         return (ladder[index] / BRACKET_OVERLAP, ladder[index + 1], crossing), None
 
     # Far out the rollouts diverge so steeply that no crossing can be interpolated before the bracket is narrow.
@@ -109,7 +109,7 @@ def _goal_level(problem, candidate, policy, goal_set: Ellipsoids, box, key, effo
 
 
 def _scan_rays(radii, ends, inside, last):
-    """Levels [N] from V at the next knots, `ends` [N D J], for the rays' ascending radii [N D J], and the last level."""
+    """Levels [N] from the last level and V at the next knots, `ends` [N D J], of the rays' ascending radii [N D J]."""
 
     def backward(target, knot):
         radii, ends, inside = knot

@@ -83,7 +83,7 @@ def record_of(problem: Problem, effort: Effort, evaluation: Evaluation) -> dict[
 
 
 def epsilon(trials: np.ndarray, confidence: float) -> float:
-    """Largest failure probability of a state uniform in any one knot's ellipsoid, at `confidence` jointly for all knots.
+    """Largest failure probability of a state uniform in any knot's ellipsoid, at `confidence` jointly for all knots.
 
     `trials` [K] states of each knot had no failure; Bonferroni's share of the doubt for each knot.
     """

@@ -20,8 +20,9 @@ from rtcd_jax.policy import nominal
 from rtcd_jax.problem import Problem
 from rtcd_jax.types import Candidate, Policy
 
+
 class Dynamics(NamedTuple):
-    """`rate(design, x [n ...], u [m ...]) -> x' [n ...]`; a `large` program is compiled once a step, not once a stage."""
+    """`rate(design, x [n ...], u [m ...]) -> x' [n ...]`; a `large` one is put once into a step's program."""
 
     rate: Callable
     large: bool
@@ -102,7 +103,7 @@ def roll_intervals(problem: Problem, candidate: Candidate, tracked: Reference, x
 
 
 def roll_at_goal(problem: Problem, candidate: Candidate, gain, x, dynamics: Dynamics, duration: float, step: float):
-    """End states [n ...] after `duration` [s] under the goal's LQR, and whether the boxes on x held on the way [...]."""
+    """End states [n ...] after `duration` [s] under the goal's LQR, and whether the boxes held on the way [...]."""
     limits, bounds = problem.state_limits, _column(problem.input_limits, x)
     gain = _align(gain, x.ndim - 1)
 

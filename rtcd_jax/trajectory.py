@@ -69,9 +69,7 @@ def _stage(problem: Problem, substeps: int, x, u, h, candidate: Candidate):
 
 
 def _cheapest(solution: interior_point.Solution, family: int) -> Trajectory:
-    solved, cost, defect = (
-        leaf.reshape(-1, family) for leaf in (solution.solved, solution.cost, solution.defect)
-    )
+    solved, cost, defect = (leaf.reshape(-1, family) for leaf in (solution.solved, solution.cost, solution.defect))
     cheapest = jnp.argmin(jnp.where(solved, cost, jnp.inf), 1)
     closest = jnp.argmin(jnp.where(jnp.isnan(defect), jnp.inf, defect), 1)  # what an unsolved candidate shows
     best = jnp.where(jnp.any(solved, 1), cheapest, closest) + family * jnp.arange(solved.shape[0])
