@@ -20,6 +20,9 @@ from rtcd_jax.results import arrays_of, record_of
 from rtcd_jax.storage import RunFolder, elite_names
 from rtcd_jax.types import Evaluation, Status
 
+LAST_FILE = Path("figures") / "convergence.pdf"
+"""Written when all else is."""
+
 
 def optimize(config: Config, folder: Path, console: Console) -> None:
     """Search as `config` says and leave everything in the run folder; goes on where an earlier call stopped.
@@ -34,32 +37,53 @@ def optimize(config: Config, folder: Path, console: Console) -> None:
         genomes = jnp.zeros((config.search.population, len(problem.free)))
         begun = run.restore(search.start(plan, jax.eval_shape(evaluate, genomes, jax.random.key(0))))
         done = int(begun.generation)
-        if done == config.search.generations and elite_names(folder):
+        if done == config.search.generations and (folder / LAST_FILE).is_file():
             console.message(f"{folder} is complete: {done} generations, {len(elite_names(folder))} elites")
             return
         if done:
             console.message(f"{folder}: going on after generation {done}")
-        state = begun
-        clock = time.monotonic()
+        console.message(f"compiling the evaluation of {config.search.population} candidates on {_devices()}")
+        state, clock = begun, _Clock(config.search.population)
         for state, generation in search.run(plan, evaluate, begun):
             run.append(vars(generation))
             run.save_if_due(state, int(state.generation))
-            console.progress(_progress(config, generation, done, time.monotonic() - clock))
+            console.progress(_progress(config, generation, clock))
         run.save(state, int(state.generation))
         _finish(problem, plan, evaluate, state, run, console)
 
 
-def _progress(config: Config, generation: search.Generation, begun: int, elapsed: float) -> Progress:
-    here = generation.index + 1 - begun
+class _Clock:
+    """Wall time of this process' generations; the first one compiles and says little about the others."""
+
+    def __init__(self, population: int):
+        self.population = population
+        self.begun = time.monotonic()
+        self.ends: list[float] = []
+
+    def tick(self) -> tuple[float, float]:
+        """At a generation's end: seconds since the start, candidates per second."""
+        self.ends.append(time.monotonic())
+        start, count = (self.begun, 1) if len(self.ends) == 1 else (self.ends[0], len(self.ends) - 1)
+        return self.ends[-1] - self.begun, count * self.population / (self.ends[-1] - start)
+
+
+def _devices() -> str:
+    devices = jax.devices()
+    return f"{len(devices)} {devices[0].device_kind} device{'s' if len(devices) > 1 else ''}"
+
+
+def _progress(config: Config, generation: search.Generation, clock: _Clock) -> Progress:
+    elapsed, rate = clock.tick()
+    left = config.search.generations - generation.index - 1
     return Progress(
         generation=generation.index + 1,
         generations=config.search.generations,
         best=generation.best_so_far,
         median=generation.median,
         feasible=generation.feasible,
-        rate=here * config.search.population / elapsed,
+        rate=rate,
         elapsed=elapsed,
-        left=elapsed / here * (config.search.generations - generation.index - 1),
+        left=left * config.search.population / rate,
         failures={name: count for name, count in generation.counts.items() if name != Status.OK.name},
     )
 
