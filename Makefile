@@ -16,7 +16,7 @@ run: $(VENV)/installed
 	$(BIN)/rtcd optimize configs/pendulum_rtcd.yaml
 
 test: $(VENV)/installed-dev
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest -n 2 --dist loadfile
 
 lint: $(VENV)/installed-dev
 	$(BIN)/ruff check

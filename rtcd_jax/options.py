@@ -41,7 +41,7 @@ class VerifyOptions:
     """Simulate fresh random states of a run's funnels with independent integrators; exit code 1 if too many fail."""
 
     run: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RUN", help="the run folder")]
-    states: Annotated[int, tyro.conf.arg(help="fresh states, shared out over the ellipsoids of all knots [-] (>= the number of knots)")] = 1000
+    states: Annotated[int, tyro.conf.arg(help="fresh states, over the ellipsoids of all knots [-] (>= knots)")] = 1000
     seed: Annotated[int, tyro.conf.arg(help="of the states [-] (>= 0)")] = 0
 
 
