@@ -181,7 +181,8 @@ def test_a_share_is_that_part_of_the_states(share, trials):
     chosen = _share(jax.random.key(0), knots, funnel)
     where = np.asarray(chosen.knots)
     assert len(set(where.tolist())) == len(where)
-    assert where.min() >= 0 and where.max() < knots
+    assert where.min() >= 0
+    assert where.max() < knots
     assert chosen.states <= trials
     wanted = share * trials * knots
     assert len(where) * chosen.states == pytest.approx(wanted, rel=0.05, abs=1)

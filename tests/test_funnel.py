@@ -115,7 +115,7 @@ def test_without_saturation_only_the_boxes_limit_a_resting_funnel():
 def test_a_moving_funnel_is_that_of_linear_algebra():
     """Some levels end at a box at their knot, some at a box behind it, some at the next level."""
     policy = linear.policy(np.random.default_rng(27).uniform(-6, 6, 10), 0.1)
-    box = np.abs(np.asarray(policy.trajectory.xs)).max(0) + [0.1, 0.3]
+    box = np.abs(np.asarray(policy.trajectory.xs)).max(0) + np.array([0.1, 0.3])
     problem = linear.problem_of(box, directions=96, radii=24)
     levels = np.asarray(_estimator(problem)(policy).levels)
     exact = linear.levels(policy, box, levels[-1], checks=problem.config.funnel.steps)

@@ -1,6 +1,7 @@
 """The closed loop beside an independent one: scipy's interpolants, numpy's controller, an adaptive integrator."""
 
 import dataclasses
+import itertools
 from functools import partial
 
 import jax
@@ -111,7 +112,7 @@ def test_an_interval_is_that_of_its_definition_to_fourth_order():
         assert np.all(inside)
         errors.append(np.abs(np.moveaxis(ends, 0, -1) - expected).max((1, 2)))
     assert np.all(errors[-1] < 1e-8)
-    for coarse, fine in zip(errors, errors[1:], strict=False):
+    for coarse, fine in itertools.pairwise(errors):
         np.testing.assert_allclose(coarse / fine, 16, rtol=0.2)
 
 
@@ -180,7 +181,7 @@ def _excursion(path) -> tuple[float, float]:
 def test_limits_are_watched_inside_an_interval(share):
     """A state that leaves the box and is back at the end has failed; one that only comes near has not."""
     policy = _policy(0.4, np.zeros(1), np.array([[20.0, 1.0]] * 2))
-    x = np.asarray(policy.trajectory.xs[0]) + [0.1, 1.0]
+    x = np.asarray(policy.trajectory.xs[0]) + np.array([0.1, 1.0])
     peak, at_ends = _excursion(_oracle(policy, 0, x))
     assert at_ends < 0.97 * peak
     _, inside = _rolled(policy, jnp.asarray(x)[:, None, None], 64, problem=_limited(np.inf, share * peak))
@@ -199,7 +200,7 @@ def test_limits_are_watched_on_the_way_to_the_goal(share):
 def test_a_state_that_starts_outside_has_failed():
     """It brakes at once into the box, at the motion and at the goal."""
     policy = _policy(torques=np.zeros(1), gains=np.array([[20.0, 1.0]] * 2))
-    x = np.asarray(policy.trajectory.xs[0]) + [0.0, 3.0]
+    x = np.asarray(policy.trajectory.xs[0]) + np.array([0.0, 3.0])
     at_goal = GOAL + np.array([0.0, 1.5])
     for path in (_oracle(policy, 0, x), _oracle_at_goal(at_goal, 1.0)):
         assert np.argmax(np.abs(path.y[1])) == 0
