@@ -3,6 +3,7 @@
 Designs are scaled linearly, weights logarithmically; pinned variables have no dimension.
 """
 
+from collections.abc import Sequence
 from math import log
 
 import jax.numpy as jnp
@@ -31,9 +32,15 @@ def decode(problem: Problem, genome: Float[Array, " d"]) -> Candidate:
     )
 
 
+def encode(problem: Problem, values: Sequence[float]) -> np.ndarray:
+    """The genome [d] of a candidate whose variables, in the order of `problem.variables`, have these values."""
+    paired = zip(problem.variables, values, strict=True)
+    return np.array([_to_unit(variable, value) for variable, value in paired if variable.free])
+
+
 def initial_genome(problem: Problem) -> np.ndarray:
     """The genome [d] of the configuration's initial candidate."""
-    return np.array([_to_unit(variable, variable.initial) for variable in problem.free])
+    return encode(problem, [variable.initial for variable in problem.variables])
 
 
 def _from_unit(variable: Variable, share):
