@@ -93,7 +93,7 @@ def starts(problem: Problem, dtype) -> interior_point.Guess:
     and the straight line of the paper's code often fails.
     """
     step = problem.config.trajectory.step
-    pace = _slowest_oscillation(problem) / (2 * np.pi)
+    pace = slowest_oscillation(problem) / (2 * np.pi)
     family = []
     for share in (0.25, 0.5):
         h = step.min + share * (step.max - step.min)
@@ -101,7 +101,7 @@ def starts(problem: Problem, dtype) -> interior_point.Guess:
     return interior_point.Guess(*(jnp.asarray(np.stack(leaves, -1), dtype) for leaves in zip(*family, strict=True)))
 
 
-def _slowest_oscillation(problem: Problem) -> float:
+def slowest_oscillation(problem: Problem) -> float:
     """Of the initial design about the start, without input [rad/s]; 0 if it does not oscillate."""
     plant = problem.plant
     with jax.ensure_compile_time_eval():  # the starts are constants of the compiled program
