@@ -8,6 +8,7 @@ midpoint step instead). This verb plans for a whole population at once rather th
 solver refills its lanes as candidates finish, so that slow ones do not hold up their neighbours.
 """
 
+from collections.abc import Callable
 from functools import partial
 
 import jax
@@ -37,9 +38,8 @@ def plan(problem: Problem, candidates: Candidate) -> Trajectory:
     settings = problem.config.trajectory
     parameters = jax.tree.map(lambda leaf: jnp.moveaxis(leaf, 0, -1), candidates)
     control = interior_point.ControlProblem(
-        stage=partial(_stage, problem, settings.substeps),
-        # One RK4 step per interval is within about 1e-3 of the interval map: enough for a Newton method's derivatives.
-        model=partial(_stage, problem, 1),
+        stage=partial(_stage, problem, partial(interval_map, problem, substeps=settings.substeps)),
+        model=partial(_stage, problem, partial(_rough_interval_map, problem)),
         start=problem.start,
         goal=problem.goal,
         state_limits=problem.state_limits,
@@ -59,13 +59,21 @@ def interval_map(problem: Problem, candidate: Candidate, x, u, h, substeps: int)
     return jnp.stack(rk4(dynamics, split(x), u, h, substeps))
 
 
-def _stage(problem: Problem, substeps: int, x, u, h, candidate: Candidate):
+def _rough_interval_map(problem: Problem, candidate: Candidate, x, u, h):
+    """Phi by one RK4 step, within about 1e-3: enough for the derivatives of a Newton method.
+
+    On whole arrays: derivatives of components make a program of twice the time.
+    """
+    return rk4(partial(problem.plant.dynamics, candidate.design), x, u, h, 1)
+
+
+def _stage(problem: Problem, interval: Callable, x, u, h, candidate: Candidate):
     """One interval's end and cost for x [n N P], u [m N P], h [P]."""
     error = x - jnp.asarray(problem.goal, x.dtype)[:, None, None]
     q, r = candidate.q[:, None], candidate.r[:, None]
     running = 0.5 * (jnp.sum(q * error**2, 0) + jnp.sum(r * u**2, 0))
     cost = h * (running + problem.config.trajectory.time_weight)
-    return interval_map(problem, candidate, x, u, h, substeps), cost
+    return interval(candidate, x, u, h), cost
 
 
 def _cheapest(solution: interior_point.Solution, family: int) -> Trajectory:

@@ -24,11 +24,11 @@ class Settings(NamedTuple):
     """Tolerances and the constants of the method."""
 
     max_iterations: int = 200
-    lanes: int = 48
+    lanes: int = 32
     defect_tolerance: float = 1e-9
     dual_tolerance: float = 1e-4  # relative to 1 + max |multiplier|
     complementarity_tolerance: float = 1e-5  # likewise
-    barrier_start: float = 0.01
+    barrier_start: float = 0.3
     barrier_floor: float = 1e-8
     barrier_factor: float = 0.2  # kappa_mu, (7)
     barrier_power: float = 1.5  # theta_mu, (7)
