@@ -72,7 +72,8 @@ def problem_of(state_limits, limit=UNBOUNDED, intervals=10, **funnel) -> Problem
     """The linear robot in these boxes, its goal the origin."""
     data = yaml.safe_load(configuration.EXAMPLE)
     data["trajectory"] = {"knots": intervals + 1}
-    data["funnel"] = {"rollouts": "closed_form"} | funnel
+    sampling = {"rollouts": "closed_form", "directions": 48, "radii": 12, "steps": 8, "trials": 64}
+    data["funnel"] = sampling | funnel
     plant = Unstable(limit)
     limits = np.array(state_limits, float)
     return Problem(configuration.parse(data), plant, np.zeros(2), np.zeros(2), limits, np.array([limit]), ())

@@ -126,11 +126,14 @@ from rtcd_jax.evaluation import make_evaluate, spread
 from tests import pipeline
 from tests.test_evaluation import _assert_close
 evaluate, devices = make_evaluate(pipeline.problem()), jax.devices()
-one, two, four = (jax.device_get(spread(evaluate, devices[:n])(pipeline.genomes(), pipeline.GENERATION)) for n in (1, 2, 4))
+
+def on(n):
+    return jax.device_get(spread(evaluate, devices[:n])(pipeline.genomes(), pipeline.GENERATION))
+
+one, two, four = map(on, (1, 2, 4))
 _assert_close(two, one)
 _assert_close(four, one)
-again = jax.device_get(spread(evaluate, devices[:4])(pipeline.genomes(), pipeline.GENERATION))
-assert pipeline.same(again, four)
+assert pipeline.same(on(4), four)
 print("equal")
 """
 
