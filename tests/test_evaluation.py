@@ -83,13 +83,13 @@ def test_a_population_is_its_candidates_one_by_one():
 
 @pytest.mark.slow
 def test_a_resampled_funnel_is_about_the_same_policy():
-    """With the same effort and key it is the same funnel, with another key the same policy."""
+    """With the same effort and key it is the same funnel, with another key other levels but where a box ends them."""
     row = jax.tree.map(lambda leaf: leaf[pipeline.RTC], pipeline.evaluated())
     again = jax.jit(partial(resample, pipeline.problem(), search_effort(pipeline.problem())))
     _assert_close(again(row, pipeline.GENERATION), row)
     other = again(row, jax.random.key(1))
     assert same(other.funnel.policy, row.funnel.policy)
-    assert not np.any(other.funnel.levels == row.funnel.levels)
+    assert np.mean(np.asarray(other.funnel.levels == row.funnel.levels)) < 0.2
 
 
 @pytest.mark.slow
