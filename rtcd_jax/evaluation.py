@@ -10,7 +10,7 @@ from functools import partial
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.sharding import AxisType, Mesh, PartitionSpec
+from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec
 
 from rtcd_jax import rollout
 from rtcd_jax.confirmation import Dynamics, Effort
@@ -74,7 +74,9 @@ def spread(evaluate: Evaluate, devices: list[jax.Device]) -> Evaluate:
     def on_all(genomes, key) -> Evaluation:
         count = genomes.shape[0]
         padding = jnp.repeat(genomes[-1:], -count % len(devices), 0)
-        evaluation = shared(jnp.concatenate([genomes, padding]), key)
+        # Wherever they come from, placed alike: one program for all callers.
+        padded = jax.device_put(jnp.concatenate([genomes, padding]), NamedSharding(mesh, split))
+        evaluation = shared(padded, jax.device_put(key, NamedSharding(mesh, whole)))
         return jax.tree.map(lambda leaf: leaf[:count], evaluation)
 
     return on_all
