@@ -42,7 +42,7 @@ def plan(problem: Problem, candidates: Candidate) -> Trajectory:
         model=partial(_stage, problem, partial(_rough_interval_map, problem)),
         start=problem.start,
         goal=problem.goal,
-        state_limits=problem.state_limits,
+        state_limits=settings.limit_share * problem.state_limits,
         input_limits=problem.input_limits,
         step_limits=(settings.step.min, settings.step.max),
     )
