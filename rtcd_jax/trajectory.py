@@ -38,8 +38,9 @@ def plan(problem: Problem, candidates: Candidate) -> Trajectory:
     settings = problem.config.trajectory
     parameters = jax.tree.map(lambda leaf: jnp.moveaxis(leaf, 0, -1), candidates)
     control = interior_point.ControlProblem(
-        stage=partial(_stage, problem, partial(interval_map, problem, substeps=settings.substeps)),
-        model=partial(_stage, problem, partial(_rough_interval_map, problem)),
+        interval=lambda x, u, h, candidate: interval_map(problem, candidate, x, u, h, settings.substeps),
+        rate=lambda x, u, candidate: problem.plant.dynamics(candidate.design, x, u),
+        running=partial(_running, problem),
         start=problem.start,
         goal=problem.goal,
         state_limits=problem.state_limits,
@@ -59,21 +60,11 @@ def interval_map(problem: Problem, candidate: Candidate, x, u, h, substeps: int)
     return jnp.stack(rk4(dynamics, split(x), u, h, substeps))
 
 
-def _rough_interval_map(problem: Problem, candidate: Candidate, x, u, h):
-    """Phi by one RK4 step, within about 1e-3: enough for the derivatives of a Newton method.
-
-    On whole arrays: derivatives of components make a program of twice the time.
-    """
-    return rk4(partial(problem.plant.dynamics, candidate.design), x, u, h, 1)
-
-
-def _stage(problem: Problem, interval: Callable, x, u, h, candidate: Candidate):
-    """One interval's end and cost for x [n N P], u [m N P], h [P]."""
-    error = x - jnp.asarray(problem.goal, x.dtype)[:, None, None]
-    q, r = candidate.q[:, None], candidate.r[:, None]
-    running = 0.5 * (jnp.sum(q * error**2, 0) + jnp.sum(r * u**2, 0))
-    cost = h * (running + problem.config.trajectory.time_weight)
-    return interval(candidate, x, u, h), cost
+def _running(problem: Problem, x, u, candidate: Candidate):
+    """Cost per time of the components x (n arrays) and u (m arrays)."""
+    states = sum(q * (x - goal) ** 2 for q, x, goal in zip(candidate.q, x, problem.goal, strict=True))
+    inputs = sum(r * u**2 for r, u in zip(candidate.r, u, strict=True))
+    return 0.5 * (states + inputs) + problem.config.trajectory.time_weight
 
 
 def _cheapest(solution: interior_point.Solution, family: int) -> Trajectory:

@@ -11,12 +11,15 @@ every array, see batched.py, and problems go through in lanes, see lanes.py.
 from collections.abc import Callable
 from typing import NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from rtcd_jax.numerics import kkt
+from rtcd_jax.numerics.entries import dot, plus
+from rtcd_jax.numerics.expansion import Expansion, expander
 from rtcd_jax.numerics.lanes import solve_in_lanes
 
 
@@ -45,15 +48,18 @@ DEFAULTS = Settings()
 
 
 class ControlProblem(NamedTuple):
-    """What to solve. `stage(x, u, h, parameters) -> (next x, cost)` works elementwise on trailing axes.
+    """What to solve. The functions work elementwise on trailing axes.
 
-    `model` is what the derivatives are taken of: the stage itself, or a cheaper integration of the same dynamics. It
-    decides how fast the iteration contracts (an inexact Newton method) and, to second order, how optimal its end is;
-    defects are always measured by `stage`, so that the end is a solution of the accurate dynamics.
+    `interval(x [n ..], u [m ..], h, parameters)` is the next x, `running(x, u, parameters)` the cost per time of an
+    interval, `rate(x, u, parameters)` the time derivative of x, both of tuples x and u of components. Derivatives are
+    taken of one Runge-Kutta step of `rate`, a cheaper integration of the same dynamics. Its error decides how fast the
+    iteration contracts (an inexact Newton method) and, to second order, how optimal its end is; defects are always
+    measured by `interval`, so that the end is a solution of the accurate dynamics.
     """
 
-    stage: Callable
-    model: Callable
+    interval: Callable
+    rate: Callable
+    running: Callable
     start: np.ndarray
     goal: np.ndarray
     state_limits: np.ndarray
@@ -138,33 +144,33 @@ class _Solver:
         self.upper = _Boxed(as_column(x_limit), as_column(problem.input_limits), as_column([high]))
         travel = np.maximum(1.0, np.abs(problem.start - problem.goal))
         scale_x = np.where(np.isfinite(problem.state_limits), problem.state_limits, travel)
-        self.scaling = as_column(np.concatenate([1 / scale_x**2, [0.0], 1 / problem.input_limits**2]))
+        self.scaling = [float(s) for s in (*1 / scale_x**2, 0.0, *1 / problem.input_limits**2)]
         self.step_scaling = 4 / (high - low) ** 2
 
     # ---- the model
 
     def simulate(self, xs, us, h, parameters):
         """Defects [N n P] and the objective [P]."""
-        nexts, costs = self.problem.stage(jnp.moveaxis(xs[:-1], 0, 1), jnp.moveaxis(us, 0, 1), h, parameters)
-        return jnp.moveaxis(nexts, 1, 0) - xs[1:], jnp.sum(costs, 0)
+        x, u = jnp.moveaxis(xs[:-1], 0, 1), jnp.moveaxis(us, 0, 1)
+        nexts = self.problem.interval(x, u, h, parameters)
+        return jnp.moveaxis(nexts, 1, 0) - xs[1:], h * jnp.sum(self.problem.running(tuple(x), tuple(u), parameters), 0)
 
-    def expand(self, xs, us, h, multipliers, parameters):
-        """Jacobians [N n w P], cost gradients [N w P] and Hessians of the Lagrangian [N w w P] of the model.
+    def expand(self, xs, us, h, multipliers, parameters) -> Expansion:
+        """The model's slopes and curvature; entries [N P] or numbers."""
+        expand = expander(self.problem.rate, self.problem.running, self.n, self.m, parameters)
+        stages = (xs[:-1], us, multipliers)
 
-        The Lagrangian is a sum over intervals and problems, so one gradient of the sum is all their gradients.
-        """
-        n, w = self.n, self.n + 1 + self.m
-        x, u, lam = (jnp.moveaxis(a, 0, 1) for a in (xs[:-1], us, multipliers))
-        z = jnp.concatenate([x, jnp.broadcast_to(h, (1, *x.shape[1:])), u])
+        def one(stage):
+            return expand(*(tuple(part) for part in stage[:2]), h, tuple(stage[2]), parameters)
 
-        def lagrangian(z):
-            nexts, costs = self.problem.model(z[:n], z[n + 1 :], z[n], parameters)
-            return jnp.sum(costs) + jnp.sum(lam * nexts), (nexts, costs)
+        def packed(stage):
+            return jnp.stack(jax.tree.leaves(eqx.filter(one(stage), eqx.is_array)))
 
-        _, push = jax.linearize(jax.grad(lagrangian, has_aux=True), z)
-        basis = jnp.broadcast_to(jnp.eye(w, dtype=z.dtype)[:, :, None, None], (w, *z.shape))
-        hessian, (jacobian, gradient) = jax.vmap(push)(basis)
-        return jnp.transpose(jacobian, (2, 1, 0, 3)), jnp.moveaxis(gradient, 0, 1), jnp.transpose(hessian, (2, 0, 1, 3))
+        layout = eqx.filter_eval_shape(one, jax.tree.map(lambda leaf: leaf[0], stages))
+        numbers = jax.tree.map(lambda leaf: leaf if isinstance(leaf, float) else None, layout)
+        arrays = iter(jnp.moveaxis(jax.lax.map(packed, stages), 1, 0))
+        fill = lambda number: next(arrays) if number is None else number  # noqa: E731
+        return jax.tree.map(fill, numbers, is_leaf=lambda leaf: leaf is None)
 
     def values(self, xs, us, h) -> _Boxed:
         return _Boxed(xs[1:-1, self.boxed], us, h[None])
@@ -209,9 +215,9 @@ class _Solver:
     def advance(self, it: _Iterate, parameters) -> _Iterate:
         """One interior-point iteration; lanes that are finished come back unchanged."""
         s = self.settings
-        jacobian, gradient, hessian = self.expand(it.xs, it.us, it.h, it.multipliers, parameters)
+        expansion = self.expand(it.xs, it.us, it.h, it.multipliers, parameters)
         slacks = self.slacks(self.values(it.xs, it.us, it.h))
-        dual_error = self.stationarity(it, jacobian, gradient)
+        dual_error = self.stationarity(it, expansion)
         defect = _largest(it.defects)
         size = 1 + _largest(it.multipliers)
         gap = _complementarity(it.duals, slacks, 0.0)
@@ -226,16 +232,19 @@ class _Solver:
             iterations=it.iterations + 1,
             solved=solved,
         )
-        subproblem = self.subproblem(state, slacks, jacobian, gradient, hessian)
+        subproblem = self.subproblem(state, slacks, expansion)
         moved = self.move(state, slacks, subproblem, parameters)
         # A lane that is solved keeps the point that was measured, one that had finished before keeps everything.
         moved = _where(solved, state, moved)
         return _where(self.finished(it), it, moved)
 
-    def stationarity(self, it: _Iterate, jacobian, gradient):
+    def stationarity(self, it: _Iterate, expansion: Expansion):
         """Largest entry of the Lagrangian's gradient, over max(100, mean multiplier)/100: E_0 of (5)."""
         n = self.n
-        slope = gradient + jnp.sum(jacobian * it.multipliers[:, :, None], 1)
+        multipliers = [it.multipliers[:, i] for i in range(n)]
+        columns = zip(*expansion.jacobian, strict=True)
+        slope = [plus(g, dot(column, multipliers)) for g, column in zip(expansion.gradient, columns, strict=True)]
+        slope = self.stacked(slope, it)
         by_state = slope[1:, :n] - it.multipliers[:-1]
         by_state = by_state.at[:, self.boxed].add(it.duals.xs[1] - it.duals.xs[0])
         by_input = slope[:, n + 1 :] + it.duals.us[1] - it.duals.us[0]
@@ -254,24 +263,34 @@ class _Solver:
             barrier = jnp.where(accurate, lower, barrier)
         return barrier
 
-    def subproblem(self, it: _Iterate, slacks: _Boxed, jacobian, gradient, hessian) -> kkt.Subproblem:
+    def subproblem(self, it: _Iterate, slacks: _Boxed, expansion: Expansion) -> kkt.Subproblem:
         """The quadratic model with the barrier's primal-dual terms and the regularization added: (13)."""
         n = self.n
         stiffness = jax.tree.map(lambda dual, slack: jnp.sum(dual / slack, 0), it.duals, slacks)
         force = jax.tree.map(lambda slack: it.barrier * (1 / slack[1] - 1 / slack[0]), slacks)
-        inputs = np.arange(n + 1, n + 1 + self.m)
-        diagonal = jnp.broadcast_to(it.regularization * self.scaling, gradient.shape)
-        diagonal = diagonal.at[:, inputs].add(stiffness.us)
-        diagonal = diagonal.at[1:, self.boxed].add(stiffness.xs)
-        every = np.arange(hessian.shape[1])
+        hessian, gradient = [[*row] for row in expansion.hessian], [*expansion.gradient]
+        for i, scaling in enumerate(self.scaling):
+            hessian[i][i] += it.regularization * scaling
+        for bounded, i in enumerate(self.boxed):
+            hessian[i][i] += jnp.pad(stiffness.xs[:, bounded], ((1, 0), (0, 0)))
+            gradient[i] += jnp.pad(force.xs[:, bounded], ((1, 0), (0, 0)))
+        for i in range(self.m):
+            hessian[n + 1 + i][n + 1 + i] += stiffness.us[:, i]
+            gradient[n + 1 + i] += force.us[:, i]
+        every = (it.us.shape[0], it.h.shape[-1])
+        hessian = [[*row[:i], jnp.broadcast_to(row[i], every)] for i, row in enumerate(hessian)]
         return kkt.Subproblem(
-            hessians=hessian.at[:, every, every].add(diagonal),
-            gradients=gradient.at[:, inputs].add(force.us).at[1:, self.boxed].add(force.xs),
-            jacobians=jacobian,
+            hessian=hessian,
+            gradient=gradient,
+            jacobian=expansion.jacobian,
             defects=it.defects,
             curvature=stiffness.h[0] + it.regularization * self.step_scaling,
             slope=force.h[0],
         )
+
+    def stacked(self, row, it: _Iterate):
+        """Entries as an array [N w P]."""
+        return jnp.stack([jnp.broadcast_to(entry, (it.us.shape[0], it.h.shape[-1])) for entry in row], 1)
 
     def move(self, it: _Iterate, slacks: _Boxed, subproblem: kkt.Subproblem, parameters) -> _Iterate:
         """Newton step, fraction to the boundary, filter line search, new regularization."""
@@ -288,10 +307,11 @@ class _Solver:
         fraction = jnp.maximum(s.boundary_fraction, 1 - it.barrier)
         longest = _boundary_step(slacks, approach, fraction)
         longest_dual = _boundary_step(it.duals, dual_step, fraction)
+        gradient = self.stacked(subproblem.gradient, it)
         descent = (
-            _total(subproblem.gradients[:, :n] * step.dxs[:-1])
-            + _total(subproblem.gradients[:, n + 1 :] * step.dus)
-            + (jnp.sum(subproblem.gradients[:, n], 0) + subproblem.slope) * step.dh
+            _total(gradient[:, :n] * step.dxs[:-1])
+            + _total(gradient[:, n + 1 :] * step.dus)
+            + (jnp.sum(gradient[:, n], 0) + subproblem.slope) * step.dh
         )
         search = self.line_search(it, slacks, step, longest, descent, usable, parameters)
         length = search.length

@@ -25,17 +25,22 @@ PARAMETERS = {
 }
 
 
-def stage(x, u, h, parameters, substeps=4):
-    def rate(x, u):
-        return jnp.stack([x[1], parameters["gain"] * u[0] - parameters["sway"] * jnp.sin(x[0])])
+def rate(x, u, parameters):
+    return jnp.stack([x[1], parameters["gain"] * u[0] - parameters["sway"] * jnp.sin(x[0])])
 
-    cost = h * (parameters["time"] + 0.5 * parameters["effort"] * u[0] ** 2)
-    return rk4(rate, x, u, h, substeps), cost
+
+def running(x, u, parameters):
+    return parameters["time"] + 0.5 * parameters["effort"] * u[0] ** 2
+
+
+def stage(x, u, h, parameters, substeps=4):
+    return rk4(lambda x, u: rate(x, u, parameters), x, u, h, substeps), h * running(x, u, parameters)
 
 
 CART = ControlProblem(
-    stage=stage,
-    model=lambda *arguments: stage(*arguments, substeps=1),
+    interval=lambda *arguments: stage(*arguments)[0],
+    rate=rate,
+    running=running,
     start=np.zeros(2),
     goal=np.array([1.0, 0.0]),
     state_limits=np.array([np.inf, SPEED]),
@@ -153,7 +158,7 @@ def test_defects_and_costs_are_those_of_the_accurate_stage(solution):
         assert solution.cost[index, 0] == pytest.approx(float(np.sum(costs)), rel=1e-12)
     parameters = {key: values[SWAYING] for key, values in PARAMETERS.items()}
     xs, us, h = (leaf[..., SWAYING, 0] for leaf in (solution.xs, solution.us, solution.h))
-    coarse, _ = CART.model(xs[:-1].T, us.T, h, parameters)
+    coarse, _ = stage(xs[:-1].T, us.T, h, parameters, substeps=1)
     assert np.max(np.abs(coarse.T - xs[1:])) > 1e-7
 
 
