@@ -35,13 +35,13 @@ class Settings(NamedTuple):
     barrier_floor: float = 1e-8
     barrier_factor: float = 0.2  # kappa_mu, (7)
     barrier_power: float = 1.5  # theta_mu, (7)
-    barrier_accuracy: float = 100.0  # kappa_epsilon of algorithm A-2; their 10 is stricter than a warm filter needs
+    barrier_accuracy: float = 1000.0  # kappa_epsilon of algorithm A-2; their 10 is stricter than a warm filter needs
     boundary_fraction: float = 0.99  # tau_min, (8)
     regularization_start: float = 1.0
     regularization_factor: float = 4.0
     trials: int = 3  # few: a lane that backtracks keeps the others waiting, more regularization helps as well
     backtracking: float = 0.4
-    filter_size: int = 48
+    filter_size: int = 16
 
 
 DEFAULTS = Settings()
