@@ -148,6 +148,9 @@ class TrajectoryConfig(Settings):
         default=5, ge=1, description="RK4 steps of dynamics and Riccati equation inside an interval [-]"
     )
     max_iterations: int = Field(default=200, ge=1, description="iterations of the trajectory optimizer [-]")
+    starts: int = Field(
+        default=1, ge=1, le=2, description="starts to solve, the cheapest is kept; others replace those that fail [-]"
+    )
 
 
 class GoalConfig(Settings):

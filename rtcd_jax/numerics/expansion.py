@@ -3,7 +3,8 @@
 With k_i = h f(x_i, u), x_i = x + c_i k_{i-1} and Phi = x + (k_1 + 2 k_2 + 2 k_3 + k_4)/6, let Y_i be the derivative of
 (x_i, u) by z = (x, h, u), and mu_i the derivative of lambda' Phi by k_i. Then
 
-    d k_i = h (f_x f_u) Y_i + f e_h',    H = sum_i Y_i' (h sum_j mu_ij f_j,zz) Y_i + g_i e_h' + e_h g_i',    g_i' = mu_i' (f_x f_u) Y_i
+    d k_i = h (f_x f_u) Y_i + f e_h',   g_i = Y_i' (f_x f_u)' mu_i,
+    H = sum_i  Y_i' (h sum_j mu_ij f_j,zz) Y_i + g_i e_h' + e_h g_i'
 
 since k is linear in h and x_i in the k. Automatic differentiation is used on f alone, entry by entry: on a whole step
 it makes a program of five times the time for four states.
@@ -80,7 +81,8 @@ def _fold(matrix, numbers) -> Matrix:
 def expander(rate: Callable, running: Callable, n: int, m: int, parameters) -> Callable:
     """`expand(x, u, h, multipliers, parameters) -> Expansion` of one step, for tuples of components.
 
-    The batch is the last axis of every parameter. `rate(x, u, parameters)` is f, as an array or a tuple, `running` the cost per time; cost h running(x, u).
+    The batch is the last axis of every parameter. `rate(x, u, parameters)` is f, as an array or a tuple; the step costs
+    h `running(x, u, parameters)`.
     """
     f = Differentiated(unstacked(rate), n, m, parameters)
     cost = Differentiated(lambda x, u, p: (running(x, u, p),), n, m, parameters)

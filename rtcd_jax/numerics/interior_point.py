@@ -1,6 +1,6 @@
 """Batched primal-dual interior-point SQP for trajectory optimisation with pinned ends and one free step length.
 
-    minimise over x_1 .. x_{N-1}, u_0 .. u_{N-1}, h     sum_k cost(x_k, u_k, h)
+    minimise over x_1 .. x_{N-1}, u_0 .. u_{N-1}, h     sum_k h running(x_k, u_k)
     subject to   x_{k+1} = next(x_k, u_k, h),  x_0 and x_N given,  boxes on x, u and h
 
 The method is IPOPT's (Waechter and Biegler, Math. Programming 106, 2006; equation numbers below are theirs) with the
@@ -22,12 +22,18 @@ from rtcd_jax.numerics.entries import dot, plus
 from rtcd_jax.numerics.expansion import Expansion, expander
 from rtcd_jax.numerics.lanes import solve_in_lanes
 
+CACHE = 2**20
+"""Second-level cache of a core [bytes]."""
+
+
+VECTOR = 8
+"""Lanes come in whole vectors: of the rest of a vector, a compiler may round sines and logarithms differently."""
+
 
 class Settings(NamedTuple):
     """Tolerances and the constants of the method."""
 
-    max_iterations: int = 200
-    lanes: int = 32
+    lanes: int = 32  # at most; whole vectors
     defect_tolerance: float = 1e-9
     dual_tolerance: float = 1e-4  # relative to 1 + max |multiplier|
     complementarity_tolerance: float = 1e-5  # likewise
@@ -70,9 +76,9 @@ class ControlProblem(NamedTuple):
 class Guess(NamedTuple):
     """Where a solve starts; the ends of `xs` are overwritten by the pinned states."""
 
-    xs: Float[Array, "N+1 n P"]
-    us: Float[Array, "N m P"]
-    h: Float[Array, " P"]
+    xs: Float[Array, "N+1 n *P"]
+    us: Float[Array, "N m *P"]
+    h: Float[Array, "*P"]
 
 
 class Solution(NamedTuple):
@@ -209,10 +215,10 @@ class _Solver:
             solved=jnp.zeros((batch,), bool),
         )
 
-    def finished(self, it: _Iterate):
-        return it.solved | (it.iterations >= self.settings.max_iterations)
+    def finished(self, it: _Iterate, allowance):
+        return it.solved | (it.iterations >= allowance)
 
-    def advance(self, it: _Iterate, parameters) -> _Iterate:
+    def advance(self, it: _Iterate, parameters, allowance) -> _Iterate:
         """One interior-point iteration; lanes that are finished come back unchanged."""
         s = self.settings
         expansion = self.expand(it.xs, it.us, it.h, it.multipliers, parameters)
@@ -236,7 +242,7 @@ class _Solver:
         moved = self.move(state, slacks, subproblem, parameters)
         # A lane that is solved keeps the point that was measured, one that had finished before keeps everything.
         moved = _where(solved, state, moved)
-        return _where(self.finished(it), it, moved)
+        return _where(self.finished(it, allowance), it, moved)
 
     def stationarity(self, it: _Iterate, expansion: Expansion):
         """Largest entry of the Lagrangian's gradient, over max(100, mean multiplier)/100: E_0 of (5)."""
@@ -450,30 +456,44 @@ def _regularize(it: _Iterate, s: Settings, search: _Search):
     return jnp.minimum(jnp.where(search.forced, now, jnp.where(search.taken, changed, up)), 1e8)
 
 
-def solve(problem: ControlProblem, parameters, guesses: Guess, settings: Settings = DEFAULTS) -> Solution:
-    """Solve every problem of the batch from every guess; the batch is the last axis.
+def _lanes_in_cache(intervals: int, w: int) -> int:
+    """Lanes whose Hessians fill a core's cache; more wait for memory, fewer for calls."""
+    return max(1, CACHE // (8 * intervals * w * w) // VECTOR) * VECTOR
 
-    `parameters` is a pytree with P on the last axis of every leaf, `guesses` holds G guesses; the solutions come
-    back with P * G on the last axis, guess by guess for each problem in turn.
+
+def solve(
+    problem: ControlProblem, parameters, guess: Guess, allowance: Int[Array, " P"], settings: Settings = DEFAULTS
+) -> Solution:
+    """Solve every problem of the batch from one guess, within `allowance` iterations.
+
+    `parameters` is a pytree with P on the last axis of every leaf; so do the solutions come back. The guess has no
+    batch. A problem whose allowance is zero costs nothing; all that is said of it is that it is not solved.
     """
-    count = jax.tree.leaves(parameters)[0].shape[-1]
-    family = guesses.h.shape[-1]
-    solver = _Solver(problem, settings, guesses.xs.dtype)
+    count = allowance.shape[0]
+    solver = _Solver(problem, settings, guess.xs.dtype)
+    order = jnp.argsort(allowance == 0)  # stable: those that are wanted come first
+    place = jnp.argsort(order)
 
     def load(indices):
-        chosen = jax.tree.map(lambda leaf: leaf[..., indices // family], parameters)
-        guess = jax.tree.map(lambda leaf: leaf[..., indices % family], guesses)
-        return solver.initial(guess, chosen), chosen
+        rows = order[indices]
+        chosen = jax.tree.map(lambda leaf: leaf[..., rows], parameters)
+        start = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf[..., None], (*leaf.shape, *rows.shape)), guess)
+        return solver.initial(start, chosen), chosen, allowance[rows]
 
     def advance(state):
-        iterate, chosen = state
-        return solver.advance(iterate, chosen), chosen
+        iterate, chosen, allowed = state
+        return solver.advance(iterate, chosen, allowed), chosen, allowed
 
     def extract(state):
         it = state[0]
         return Solution(it.us, it.xs, it.h, it.cost, _largest(it.defects), it.iterations, it.solved)
 
     def finished(state):
-        return solver.finished(state[0])
+        return solver.finished(state[0], state[2])
 
-    return solve_in_lanes(load, advance, finished, extract, count * family, settings.lanes)
+    wanted = jnp.sum(allowance > 0)
+    width = min(
+        settings.lanes, _lanes_in_cache(guess.us.shape[0], solver.n + 1 + solver.m), -(-count // VECTOR) * VECTOR
+    )
+    solution = solve_in_lanes(load, advance, finished, extract, count, width, wanted)
+    return jax.tree.map(lambda leaf: leaf[..., place], solution)

@@ -141,7 +141,9 @@ def _solve_definite(lower: Matrix, right: Matrix, floor):
         pivot = plus(lower[i][i], times(-1.0, dot(scaled, factor[i])))
         positive = positive & (pivot > floor)
         pivots.append(jnp.where(pivot > floor, pivot, 1.0))
-        rows.append([plus(b, *(times(-1.0, times(factor[i][k], rows[k][c])) for k in range(i))) for c, b in enumerate(right[i])])
+        rows.append(
+            [plus(b, *(times(-1.0, times(factor[i][k], rows[k][c])) for k in range(i))) for c, b in enumerate(right[i])]
+        )
     solution = [None] * m
     for i in reversed(range(m)):
         inverse = 1 / pivots[i]

@@ -35,7 +35,12 @@ def dense(entries):
 @pytest.fixture(scope="module")
 def point():
     random = np.random.default_rng(0)
-    return random.normal(size=(n, P)), random.normal(size=(m, P)), random.uniform(0.1, 0.5, P), random.normal(size=(n, P))
+    return (
+        random.normal(size=(n, P)),
+        random.normal(size=(m, P)),
+        random.uniform(0.1, 0.5, P),
+        random.normal(size=(n, P)),
+    )
 
 
 @pytest.fixture(scope="module")

@@ -49,17 +49,23 @@ CART = ControlProblem(
 )
 
 
-def guesses():
-    """The straight line, slow and fast, with ends that the solver has to pin."""
+def guess(h):
+    """The straight line, with ends that the solver has to pin."""
     line = np.stack([np.linspace(0.2, 1, N + 1), np.full(N + 1, 0.5)], 1)
-    return Guess(jnp.stack([line, line], -1), jnp.zeros((N, 1, 2)), jnp.array([0.3, 0.1]))
+    return Guess(jnp.asarray(line), jnp.zeros((N, 1)), jnp.asarray(h))
 
 
 @jax.jit
-def optimize(parameters, max_iterations):
-    """Both guesses of every problem, [.. P 2]; three lanes, so that they are refilled."""
-    solution = solve(CART, parameters, guesses(), Settings(lanes=3, max_iterations=max_iterations))
-    return jax.tree.map(lambda leaf: leaf.reshape(*leaf.shape[:-1], -1, 2), solution)
+def optimize(parameters, allowance):
+    """Every problem from a slow and a fast guess, [.. P 2]: the last of three copies, on lanes that are refilled."""
+    thrice = lambda leaf: jnp.tile(leaf, 3)  # noqa: E731
+    allowance = thrice(jnp.broadcast_to(jnp.asarray(allowance), parameters["time"].shape))
+
+    def from_guess(h):
+        copies = solve(CART, jax.tree.map(thrice, parameters), guess(h), allowance, Settings(lanes=8))
+        return jax.tree.map(lambda leaf: leaf[..., -6:], copies)
+
+    return jax.tree.map(lambda leaf: jnp.moveaxis(leaf, 0, -1), jax.lax.map(from_guess, jnp.array([0.3, 0.1])))
 
 
 @pytest.fixture(scope="module")
@@ -175,6 +181,15 @@ def test_iterations_are_counted_to_the_one_that_solves(solution):
     np.testing.assert_array_equal(one_less.solved[:4], solution.iterations[:4] < needed)
 
 
+def test_problems_without_allowance_are_left_out_and_change_no_other(solution):
+    some = jax.tree.map(np.asarray, optimize(PARAMETERS, np.where(np.isin(np.arange(6), [FAST, WEAK]), 0, MOST)))
+    others = [FRUGAL, SLOW_CART, SWAYING, BROKEN]
+    for theirs, ours in zip(some, solution, strict=True):
+        np.testing.assert_array_equal(theirs[..., others, :], ours[..., others, :])
+    assert not np.any(some.solved[[FAST, WEAK]])
+    np.testing.assert_array_equal(some.iterations[[FAST, WEAK]], 0)
+
+
 def test_a_problem_does_not_notice_its_neighbours(solution):
     """The same programs on shuffled problems and with a NaN in place of another: equal to the last bit."""
     order = np.array([3, 5, 0, 4, 2, 1])
@@ -191,7 +206,7 @@ def test_a_problem_does_not_notice_its_neighbours(solution):
 
 def test_single_precision_stays_single():
     parameters = {key: jax.ShapeDtypeStruct((6,), jnp.float32) for key in PARAMETERS}
-    single = Guess(*(jnp.asarray(leaf, jnp.float32) for leaf in guesses()))
-    shapes = jax.eval_shape(lambda parameters: solve(CART, parameters, single), parameters)
+    single = Guess(*(jnp.asarray(leaf, jnp.float32) for leaf in guess(0.3)))
+    shapes = jax.eval_shape(lambda parameters: solve(CART, parameters, single, jnp.full(6, MOST)), parameters)
     for name in ("us", "xs", "h", "cost", "defect"):
         assert getattr(shapes, name).dtype == jnp.float32

@@ -13,6 +13,7 @@ from rtcd_jax.numerics import kkt
 N, n, m, P = 6, 3, 2, 4
 w = n + 1 + m
 
+
 class Dense(NamedTuple):
     """A subproblem as whole arrays."""
 
