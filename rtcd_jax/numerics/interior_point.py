@@ -174,7 +174,14 @@ class _Solver:
 
         layout = eqx.filter_eval_shape(one, jax.tree.map(lambda leaf: leaf[0], stages))
         numbers = jax.tree.map(lambda leaf: leaf if isinstance(leaf, float) else None, layout)
-        arrays = iter(jnp.moveaxis(jax.lax.map(packed, stages), 1, 0))
+        # One knot after another stays in a core's cache; other devices want all knots at once.
+        arrays = iter(
+            jax.lax.platform_dependent(
+                stages,
+                cpu=lambda stages: jnp.moveaxis(jax.lax.map(packed, stages), 1, 0),
+                default=lambda stages: packed(jax.tree.map(lambda leaf: jnp.moveaxis(leaf, 1, 0), stages)),
+            )
+        )
         fill = lambda number: next(arrays) if number is None else number  # noqa: E731
         return jax.tree.map(fill, numbers, is_leaf=lambda leaf: leaf is None)
 
