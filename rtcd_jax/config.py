@@ -154,6 +154,9 @@ class TrajectoryConfig(Settings):
         description="share of the state limits for the nominal motion; the rest is the funnel's [-]",
     )
     max_iterations: int = Field(default=200, ge=1, description="iterations of the trajectory optimizer [-]")
+    starts: int = Field(
+        default=1, ge=1, le=2, description="starts to solve, the cheapest is kept; others replace those that fail [-]"
+    )
 
 
 class GoalConfig(Settings):

@@ -145,6 +145,8 @@ ENDS = [
     ("trajectory.time_weight", 0, -1e-9),
     ("trajectory.substeps", 1, 0),
     ("trajectory.max_iterations", 1, 0),
+    ("trajectory.starts", 1, 0),
+    ("trajectory.starts", 2, 3),
     ("funnel.mjx_share", 1, 1.001),
     ("funnel.mjx_share", 1e-9, 0),
     ("funnel.directions", 1, 0),
