@@ -202,7 +202,7 @@ def _tell(plan: Plan, strategy: cmaes.State | NestedState, points, costs: Float[
 def _merge(
     plan: Plan, archive: Elites, evaluation: Evaluation, generation: Int[Array, "*E"], distance: float
 ) -> Elites:
-    return elites.merge(archive, new, plan.settings.objective, generation, distance)
+    return elites.merge(archive, evaluation, plan.settings.objective, generation, distance)
 
 
 def _unbound(tree):
