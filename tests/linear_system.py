@@ -106,22 +106,21 @@ def ellipsoids(policy: Policy) -> Ellipsoids:
     return Ellipsoids.about(policy.trajectory.xs.T, jnp.moveaxis(policy.values, 0, -1))
 
 
-def levels(policy: Policy, state_limits, last: float, checks: int, directions: int = 3600) -> np.ndarray:
-    """The largest levels [N+1], by linear algebra: B_k is carried into B_{k+1}, within the boxes at `checks` times an
-    interval. `last` is the last level."""
+def levels(policy: Policy, state_limits, last: float, checks: int, margin: float) -> np.ndarray:
+    """The levels [N+1] by linear algebra, of which each gives away a `margin`: B_k is carried into B_{k+1}, within the
+    boxes at `checks` times an interval. `last` is the last level.
+    """
     xs, h = np.asarray(policy.trajectory.xs), float(policy.trajectory.dt)
-    turn = 2 * np.pi * np.arange(directions) / directions
-    unit = np.linalg.solve(np.linalg.cholesky(S).T, np.stack([np.cos(turn), np.sin(turn)]))
     forced = np.block([[A, B], [np.zeros((1, 3))]])
     found = [last]
     for k in reversed(range(len(xs) - 1)):
-        end = scipy.linalg.expm(CLOSED * h) @ unit
-        radius = np.sqrt(found[-1] / np.max(np.sum(end * (S @ end), 0)))
+        radius = np.sqrt(found[-1] / decay(h))
         for time in h * np.arange(checks + 1) / checks:
             nominal = scipy.linalg.expm(forced * time)[:2] @ np.append(xs[k], policy.trajectory.us[k, 0])
-            reach = np.abs(scipy.linalg.expm(CLOSED * time) @ unit).max(1)
+            flow = scipy.linalg.expm(CLOSED * time)
+            reach = np.sqrt(np.diag(flow @ np.linalg.solve(S, flow.T)))
             radius = min(radius, np.min((np.asarray(state_limits) - np.abs(nominal)) / reach))
-        found.append(max(radius, 0.0) ** 2)
+        found.append((1 - margin) * max(radius, 0.0) ** 2)
     return np.array(found[::-1])
 
 

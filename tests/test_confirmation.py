@@ -61,7 +61,7 @@ KNOWN = LAST * linear.decay(H) ** -np.arange(INTERVALS, -1.0, -1.0)
 
 def _effort(problem, rounds: int, follow: bool) -> Effort:
     physics = rollout.closed_form(problem.plant)
-    return Effort(problem.config.funnel, Dynamics(physics, physics), passes=1, rounds=rounds, follow=follow)
+    return Effort(problem.config.funnel, Dynamics(physics, physics), rounds=rounds, follow=follow)
 
 
 PROBLEM = linear.problem_of([1e6, 1e6], intervals=INTERVALS, trials=TRIALS)

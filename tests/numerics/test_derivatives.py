@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from rtcd_jax.numerics.derivatives import basis, jacobian
+from rtcd_jax.numerics.derivatives import basis, jacobian, value_and_jacobian
 
 
 def f(z):
@@ -21,6 +21,14 @@ def test_jacobian_is_that_of_every_point():
     assert together.shape == (4, 3, 4, 5)
     alone = jax.jit(jax.vmap(jax.vmap(jax.jacfwd(f), -1, -1), -1, -1))(z)
     np.testing.assert_allclose(together, alone, rtol=1e-13)
+
+
+def test_the_value_comes_with_its_jacobian():
+    """Both exactly those that are asked for alone."""
+    z = points(4, 5)
+    value, slope = jax.jit(lambda z: value_and_jacobian(f, z))(z)
+    np.testing.assert_allclose(value, f(z), rtol=1e-15)
+    np.testing.assert_array_equal(slope, jax.jit(lambda z: jacobian(f, z))(z))
 
 
 def test_jacobian_agrees_with_central_differences():

@@ -80,6 +80,19 @@ def test_points_of_a_row_lie_on_the_levels_they_were_asked_for():
         assert float(row.level(x)[k, 2, 3]) == pytest.approx(float(error @ row.values[:, :, k] @ error), rel=1e-12)
 
 
+@pytest.mark.parametrize("n", [1, 2, 4])
+def test_the_way_to_the_ball_is_the_way_back_from_it(n):
+    """points(radii, y) -> radii y, and |y|^2 = V of any x."""
+    row = random_row(n)
+    random = np.random.default_rng(0)
+    radii = random.uniform(0.1, 2, (4, 5, 6))
+    y = random.normal(size=(n, 4, 5, 6))
+    np.testing.assert_allclose(row.to_ball(row.points(radii, y)), radii * y, rtol=1e-9, atol=1e-10)
+    x = random.normal(size=(n, 4, 7))
+    np.testing.assert_allclose(np.sum(row.to_ball(x) ** 2, 0), row.level(x), rtol=1e-10)
+    np.testing.assert_array_equal(row.to_ball(row.centers), 0)
+
+
 def test_a_part_is_the_row_cut():
     row = random_row(2)
     radii, aim = np.array([0.5, 1.5]), np.array([[0.6], [-0.8]])
