@@ -26,9 +26,9 @@ from rtcd_jax.types import Candidate, Funnel, Policy, Status, first_failure
 SMALLEST = 1e-3
 """Radius over the box's below which a set counts as empty: a millionth of its level."""
 
-COARSE = np.geomspace(0.5, 2.0, 5)
-FINE = np.array([0.97, 1.03])
-"""Radii over that of the next level, then over the one found so: a first look and a second one."""
+WINDOWS = (2.0, 1.1)
+RADII = 3
+"""A ray is looked at so often, at so many radii from the one expected over the window to it times that."""
 
 BRACKET_OVERLAP = 1.05
 """Radii at the goal: a round starts below the last one's by this, since its other directions may find less."""
@@ -73,23 +73,25 @@ def _scan_knots(problem, candidate, sets: Ellipsoids, tracked, boxes, last, key,
         index, box, key = knot
         step = _Step.at(problem, candidate, sets, tracked, index)
 
-        def badness(radii, directions):
-            """The radii [D J] up to the box's, and at most 1 where a state stays in the boxes and in the next set."""
-            radii = jnp.broadcast_to(jnp.minimum(radii, box), (directions.shape[1], radii.shape[0]))
-            reached, peaks = step.ends(radii, directions[..., None], effort.dynamics.directions)
-            bad = jnp.maximum(jnp.sum(reached**2, 0) / target, peaks**2)
-            return radii, jnp.where(jnp.isnan(bad), jnp.inf, bad)
-
         expected = jnp.minimum(jnp.sqrt(target) * shrinkage, box)
         climbers = climb(partial(step.ends_alone, expected), climbers, funnel.climbs)
         fresh = sampling.directions(key, funnel.directions, n, dtype)
         directions = jnp.concatenate([fresh, climbers], 1)
-        rough = jnp.min(_crossings(*badness(jnp.sqrt(target) * COARSE, directions)))
-        radii, bad = badness(rough * FINE, directions)
-        level = (1 - MARGIN) * jnp.min(_crossings(radii, bad)) ** 2
+
+        def look(radius, window):
+            """The smallest radius at which a state leaves the boxes or misses the next set, seen from near `radius`."""
+            ladder = jnp.minimum(radius * window ** np.linspace(-1, 1, RADII), box)
+            radii = jnp.broadcast_to(ladder, (directions.shape[1], RADII))
+            reached, peaks = step.ends(radii, directions[..., None], effort.dynamics.directions)
+            bad = jnp.maximum(jnp.sum(reached**2, 0) / target, peaks**2)
+            bad = jnp.where(jnp.isnan(bad), jnp.inf, bad)
+            return jnp.min(_crossings(radii, bad)), bad[:, -1]
+
+        radius, bad = jax.lax.scan(look, jnp.sqrt(target), jnp.asarray(WINDOWS, dtype))
+        level = (1 - MARGIN) * radius**2
         # The worst of the random ones takes the place of the tamest climber: there may be several maxima.
-        newcomer = _worst(fresh, bad[: funnel.directions, -1], 1)
-        survivors = _worst(climbers, bad[funnel.directions :, -1], funnel.climbers - 1)
+        newcomer = _worst(fresh, bad[-1, : funnel.directions], 1)
+        survivors = _worst(climbers, bad[-1, funnel.directions :], funnel.climbers - 1)
         return (level, jnp.sqrt(level / target), jnp.concatenate([newcomer, survivors], 1)), level
 
     keys = jax.random.split(key, boxes.shape[0])

@@ -22,19 +22,16 @@ def climb(f: Callable, y, steps: int):
     best: where f saturates, the model's own maximum is often none of f.
     """
 
-    def step(carry, _):
-        y, best = carry
+    def step(y, _):
         value, j = value_and_jacobian(f, y)
         tried = _largest_nearby(mtm(j, j), mtv(j, value - mv(j, y)), y)
         found = jnp.sum(f(tried) ** 2, 0)
         found = jnp.where(jnp.isfinite(found), found, -jnp.inf)
-        highest = jnp.max(found, -1)
-        index = jnp.argmax(found, -1, keepdims=True)
-        y = jnp.where(highest > best, jnp.take_along_axis(tried, index[None], -1)[..., 0], y)
-        return (y, jnp.maximum(highest, best)), None
+        highest = jnp.argmax(found, -1, keepdims=True)
+        better = jnp.max(found, -1) > jnp.sum(value**2, 0)
+        return jnp.where(better, jnp.take_along_axis(tried, highest[None], -1)[..., 0], y), None
 
-    (y, _), _ = jax.lax.scan(step, (y, jnp.sum(f(y) ** 2, 0)), length=steps)
-    return y
+    return jax.lax.scan(step, y, length=steps)[0]
 
 
 def _largest_nearby(curvature, slope, y):

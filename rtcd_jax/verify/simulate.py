@@ -25,7 +25,7 @@ LEVEL_TOLERANCE = 1e-6
 """Share of a level by which a state may exceed it: numerical room, no allowance for failures."""
 ARRIVED = 1e-3
 """Share of the last level below which a state counts as arrived at the end of the settling time."""
-FORGOTTEN = 1e-3
+FORGOTTEN = 0.1
 """Share of that below which a settling state is followed no further."""
 SETTLING = 15.0
 """Settling time in time constants of the slowest mode about the goal."""
