@@ -1,0 +1,186 @@
+"""The funnel, interval by interval backward from the goal: its levels are what can be proved, not what was sampled.
+
+On an interval the level grows backward by the loop's own fastest growth of V, found on sampled directions, plus a
+spare rate; the limits on the states cap it. The program then has only to verify. Where it fails, the spare rate is
+raised, the interval halved, and the rate raised again.
+"""
+
+from collections.abc import Callable, Iterator
+from typing import NamedTuple, final
+
+import numpy as np
+
+from rtcd_jax.certificate import check, program
+from rtcd_jax.certificate.check import Claim, Obligation, Q, Refused, Stretch, Witness
+from rtcd_jax.certificate.loop import Loop
+
+GRID = 34
+"""Ellipsoids are rounded to multiples of 2^-34."""
+SPARE = (0.005, 0.015, 0.04, 0.1)
+"""Rates [1/s] that the level gives away, in the order of trial, before an interval is halved."""
+LARGE_SPARE = (0.25, 0.6, 1.5, 4.0, 10.0, 25.0)
+"""And for an interval of the shortest share."""
+SHORTEST = 1 / 16
+"""Shortest share of the knots' interval."""
+HEUN_STEPS = 4
+TIME_ORDER, MULTIPLIER = 5, 1
+"""Orders in s of Taylor models and of multipliers; u_lin has order 4 (K times L), so that all fit into degree 5."""
+TIERS = {2: ((5, 3), (7, 4)), 4: ((3, 2), (5, 3))}
+"""By the number of states: orders in y of Taylor models and degrees of monomials, the cheapest first."""
+ERROR_SHARE = 1 / 3
+"""A Taylor model is good enough if its error is at most this share of the spare rate."""
+BOX_SHARE = 0.999
+"""Share of the level at which an ellipsoid would touch a limit."""
+DIRECTIONS = {2: 720, 4: 4000}
+
+
+class Proved(NamedTuple):
+    """One interval that went through, its level at the start, the rate that was spared, and the margin [1/s]."""
+
+    piece: Stretch
+    rho: float
+    spare: float
+    margin: float
+
+
+class Front(NamedTuple):
+    """How far the proof has come: a share of an interval, the level and the ellipsoid there."""
+
+    knot: int
+    share: float
+    rho: float
+    axes: list
+    spare: int
+
+
+def directions(n: int) -> np.ndarray:
+    """Unit vectors [n D] that cover the sphere."""
+    if n == 2:
+        angle = np.linspace(0, 2 * np.pi, DIRECTIONS[2], endpoint=False)
+        return np.stack([np.cos(angle), np.sin(angle)])
+    found = np.random.default_rng(0).normal(size=(n, DIRECTIONS[n]))
+    return found / np.linalg.norm(found, axis=0)
+
+
+def on_grid(matrix: np.ndarray) -> list[list]:
+    """The exact matrix nearest to `matrix` on the grid."""
+    return [[Q(int(c), 1 << GRID) for c in row] for row in np.rint(matrix * 2.0**GRID)]
+
+
+@final
+class Descent:
+    """The search for one elite's funnel. `exact` asks the checker after every interval (rung *proved*)."""
+
+    def __init__(self, claim: Claim, loop: Loop, exact: bool):
+        self.claim, self.loop, self.exact = claim, loop, exact
+        self._directions = directions(claim.n)
+
+    def outlet(self, rho: float) -> Front:
+        """Where the descent begins: t_N with the level rho."""
+        last = len(self.loop.u) - 1
+        return Front(last, 1.0, rho, on_grid(self.loop.axes(last, 1.0, rho, 0.0)[0]), 0)
+
+    def down_from(self, front: Front) -> Iterator[Proved]:
+        """The intervals from the front back to t = 0, or to where nothing can be proved."""
+        waiting = [(k, 0.0, 1.0) for k in range(front.knot)]
+        if front.share > 0:
+            waiting.append((front.knot, 0.0, front.share))
+        while waiting:
+            k, start, end = waiting.pop()
+            short = end - start <= SHORTEST
+            found = self._first(k, start, end, front, short)
+            if found is None and short:
+                return
+            if found is None:
+                middle = (start + end) / 2
+                waiting += [(k, start, middle), (k, middle, end)]
+                continue
+            spare, proved = found
+            front = Front(k, start, proved.rho, proved.piece.first, max(spare - 1, 0))
+            yield proved
+
+    def _first(self, k: int, start: float, end: float, front: Front, short: bool) -> tuple[int, Proved] | None:
+        """The least spare rate, by its place, with which the interval goes through."""
+        rates = SPARE + (LARGE_SPARE if short else ())
+        for place in range(min(front.spare, len(rates) - 1), len(rates)):
+            proved = self._attempt(k, start, end, front, rates[place])
+            if proved is not None:
+                return place, proved
+        return None
+
+    def _attempt(self, k: int, start: float, end: float, front: Front, spare: float) -> Proved | None:
+        piece, rho = self._piece(k, start, end, front, spare)
+        try:
+            check.insist_bounds(self.claim, check.motion(self.claim, piece), "limits")
+            piece, todo, degree = self._models(piece, spare)
+            found = prove(todo, degree, piece.orders[0], self.exact)
+        except Refused:
+            return None
+        if found is None:
+            return None
+        return Proved(piece._replace(cases=found[0]), rho, spare, found[1])
+
+    def _piece(self, k: int, start: float, end: float, front: Front, spare: float) -> tuple[Stretch, float]:
+        """The interval's ellipsoids, from the front's level and the spare rate."""
+        loop, duration = self.loop, (end - start) * self.loop.dt
+        rho, last = self._level(k, start, end, front.rho, spare)
+        first_growth, last_growth = self._growth(k, start, rho, spare), last
+        cap = BOX_SHARE * loop.box_level(k, start)
+        if rho > cap:
+            rho = cap
+            first_growth = last_growth = float(np.log(front.rho / rho) / duration)
+        a, a_rate = loop.axes(k, start, rho, first_growth)
+        b, b_rate = loop.axes(k, end, front.rho, last_growth)
+        chord = (b - a) / 2
+        at_start, at_end = (a_rate * duration / 2 - chord) / 2, (chord - b_rate * duration / 2) / 2
+        bend = [on_grid((at_end + at_start) / 2), on_grid((at_end - at_start) / 2)]
+        share = [Q(*s.as_integer_ratio()) for s in (start, end)]
+        order = TIERS[self.claim.n][0][0]
+        return Stretch(k, *share, on_grid(a), front.axes, bend, (TIME_ORDER, order), {}), rho
+
+    def _growth(self, k: int, share: float, rho: float, spare: float) -> float:
+        return self.loop.growth(k, share, rho, self._directions) + spare
+
+    def _level(self, k: int, start: float, end: float, rho: float, spare: float) -> tuple[float, float]:
+        """The level at the start by Heun's method on its logarithm, and the growth at the end."""
+        step, share = (end - start) / HEUN_STEPS, end
+        at_end = slope = self._growth(k, end, rho, spare)
+        for i in range(HEUN_STEPS):
+            share = end - (i + 1) * step
+            guess = rho * np.exp(-step * self.loop.dt * slope)
+            rho *= np.exp(-step * self.loop.dt * (slope + self._growth(k, share, guess, spare)) / 2)
+            slope = self._growth(k, share, rho, spare)
+        return float(rho), at_end
+
+    def _models(self, piece: Stretch, spare: float) -> tuple[Stretch, dict[str, Obligation], int]:
+        """The interval's obligations by the cheapest Taylor models that are good enough."""
+        tiers = TIERS[self.claim.n]
+        for order, degree in tiers:
+            piece = piece._replace(orders=(piece.orders[0], order))
+            todo = check.funnel_obligations(self.claim, piece, "interval")
+            if max(float(each.error) for each in todo.values()) <= ERROR_SHARE * spare:
+                break
+        return piece, todo, degree
+
+
+def prove(
+    todo: dict[str, Obligation], degree: int, order: int, exact: bool
+) -> tuple[dict[str, Witness], float] | None:
+    """Witnesses by case and the least margin; None where a case has none. `exact`: the checker's margin.
+
+    Raises:
+        Refused: the checker does not accept a witness of the solver's.
+    """
+    witnesses, least = {}, np.inf
+    for case, each in todo.items():
+        multiplier = MULTIPLIER if each.where else 0
+        found = program.solve(each, program.shape_of(each, degree, order, multiplier))
+        if found is None:
+            return None
+        witnesses[case] = found.witness
+        margin = float(check.margin(each, found.witness, case)) if exact else found.margin
+        least = min(least, margin)
+    return witnesses, least
+
+
+Recorder = Callable[[Proved], None]
