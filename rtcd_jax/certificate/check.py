@@ -1003,7 +1003,7 @@ def check(content: Any, progress: Callable[[int, int], None] = lambda done, of: 
         progress(i + 1, len(pieces))
     notes.insist(isinstance(notes.value, dict), "must be an object")
     top.sealed()
-    volumes, axes = _volumes(claim, pieces, l_goal)
+    volumes, axes = volumes_of(claim, pieces, l_goal)
     begin = float((claim.start[0] + claim.start[1]) * claim.dt)
     return Report(
         claim, len(pieces), shells, begin, float(len(claim.u) * claim.dt), volumes, axes,
@@ -1011,7 +1011,9 @@ def check(content: Any, progress: Callable[[int, int], None] = lambda done, of: 
     )  # fmt: skip
 
 
-def _volumes(claim: Claim, pieces: Sequence[Stretch], l_goal: list) -> tuple[dict[str, float], dict[str, list[float]]]:
+def volumes_of(
+    claim: Claim, pieces: Sequence[Stretch], l_goal: list
+) -> tuple[dict[str, float], dict[str, list[float]]]:
     """Volumes |unit ball| det L, and half widths of the ellipsoids along each state."""
     ball = math.pi ** (claim.n / 2) / math.gamma(claim.n / 2 + 1)
 

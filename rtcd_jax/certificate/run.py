@@ -1,0 +1,142 @@
+"""`rtcd certify`: elites of a run folder in parallel processes, one line of progress, a table at the end."""
+
+import io
+import multiprocessing
+import os
+import queue
+import time
+from collections.abc import Iterator, Sequence
+from concurrent.futures import Future, ProcessPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Protocol, final
+
+from rich.box import SIMPLE
+from rich.console import Console as Terminal
+from rich.table import Table
+
+from rtcd_jax.certificate.elite import Outcome, Step, certify_elite
+from rtcd_jax.errors import UserError
+from rtcd_jax.files import replace_json, writing
+from rtcd_jax.storage import elite_names
+
+POLL = 0.2
+"""Seconds between looks at the workers' progress."""
+
+
+class Console(Protocol):
+    def message(self, text: str, /) -> None: ...
+    def progress(self, now: Any, /) -> None: ...
+
+
+@final
+@dataclass(frozen=True)
+class Progress:
+    """All elites' certificates together; `generation` of `generations` thousandths are done."""
+
+    generation: int
+    generations: int
+    step: Step
+    elapsed: float
+
+    def __str__(self) -> str:
+        step, share = self.step, self.generation / self.generations
+        left = self.elapsed * (1 - share) / share if share else float("nan")
+        return (
+            f"elite {step.elite}  interval {step.knot + 1}/{step.knots}  back to t = {step.time:.3f} s  rho {step.rho:.4g}"
+            f"  margin {step.margin:.2g}/s  elapsed {self.elapsed:.0f} s  left {left:.0f} s"
+        )
+
+
+def certify_run(folder: Path, elites: int, rung: str, workers: int, console: Console) -> bool:
+    """Certificates of a run's best elites; True if every funnel was shown from t = 0 to the goal.
+
+    Stores `certificates/NNN.json` and `certificates/summary.json`. What was finished before a kill is not done again.
+
+    Raises:
+        UserError: no run folder, a run without elites, or a folder that cannot be written.
+    """
+    names = elite_names(folder)[:elites]
+    if not names:
+        raise UserError(f"{folder} has no elites yet: finish the run first, by the command that began it")
+    target = folder / "certificates"
+    with writing(target):
+        target.mkdir(exist_ok=True)
+    outcomes: dict[str, Outcome | None] = {}
+    began, reached = time.monotonic(), dict.fromkeys(names, 0.0)
+    for event in _events(folder, names, rung, workers):
+        if isinstance(event, Step):
+            reached[event.elite] = 1 - event.knot / event.knots
+            done = round(1000 * sum(reached.values()) / len(reached))
+            console.progress(Progress(done, 1000, event, time.monotonic() - began))
+        else:
+            outcomes[event[0]] = event[1]
+    replace_json(target / "summary.json", {name: _summary(outcomes[name]) for name in names})
+    console.message(_table([outcomes[name] for name in names if outcomes[name] is not None], rung))
+    for name in names:
+        if outcomes[name] is None:
+            console.message(f"{name}: no goal region can be shown at any level that was tried")
+    return all(outcome is not None and outcome.whole for outcome in outcomes.values())
+
+
+def _events(
+    folder: Path, names: Sequence[str], rung: str, workers: int
+) -> Iterator[Step | tuple[str, Outcome | None]]:
+    """Steps of all elites as they come, and every elite's outcome by its name."""
+    context = multiprocessing.get_context("spawn")
+    steps = context.Queue()
+    pool = ProcessPoolExecutor(min(workers, len(names)), context, _remember, (steps,))
+    with pool:
+        waiting: dict[Future, str] = {pool.submit(_work, folder, name, rung): name for name in names}
+        try:
+            while waiting:
+                try:
+                    yield steps.get(timeout=POLL)
+                except queue.Empty:
+                    pass
+                for future in [future for future in waiting if future.done()]:
+                    yield waiting.pop(future), future.result()
+        finally:
+            pool.shutdown(wait=False, cancel_futures=True)
+
+
+_steps: Any = None
+
+
+def _remember(steps: Any) -> None:
+    """In a worker: where its progress goes. One thread each, since there is a worker for every core."""
+    global _steps
+    _steps = steps
+    os.environ["OMP_NUM_THREADS"] = "1"
+
+
+def _work(folder: Path, name: str, rung: str) -> Outcome | None:
+    return certify_elite(folder, name, rung, _steps.put)
+
+
+def _summary(outcome: Outcome | None) -> dict[str, Any] | None:
+    return None if outcome is None else outcome._asdict()
+
+
+def _table(outcomes: Sequence[Outcome], rung: str) -> str:
+    table = Table(box=SIMPLE, title=f"volumes: sampled / {rung}")
+    table.add_column("elite")
+    for heading in ("from [s]", "intervals", "seconds", "inlet", "sum", "ratio of sums", "integral", "goal"):
+        table.add_column(heading, justify="right")
+    for outcome in outcomes:
+        pairs = {key: f"{value:.4g} / {outcome.found[key]:.4g}" for key, value in outcome.sampled.items()}
+        ratio = outcome.found["sum"] / outcome.sampled["sum"]
+        table.add_row(
+            outcome.elite,
+            f"{outcome.start:.4g}",
+            f"{outcome.intervals}",
+            f"{outcome.seconds:.1f}",
+            pairs["inlet"],
+            pairs["sum"],
+            f"{ratio:.4f}",
+            pairs["integral"],
+            pairs["goal"],
+        )
+    text = io.StringIO()
+    Terminal(file=text, width=132).print(table)
+    return text.getvalue().rstrip()
