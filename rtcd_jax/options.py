@@ -49,8 +49,8 @@ class VerifyOptions:
 class CertifyOptions:
     """Prove the funnels of a run's best elites by sums of squares; `rtcd check` checks what this writes.
 
-    Rungs: certified, by the solver's floating-point numbers; proved, by exact arithmetic for the true dynamics. The same
-    command goes on after a kill. Exit code 1 if a funnel was not shown from t = 0 to the goal.
+    Rungs: certified, by the solver's floating-point numbers; proved, by exact arithmetic for the true dynamics. The
+    same command goes on after a kill. Exit code 1 if a funnel was not shown from t = 0 to the goal.
     """
 
     run: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RUN", help="the run folder")]

@@ -1,34 +1,36 @@
-"""The independent checker: accepts a certificate only if the theorem below follows from it, by exact arithmetic.
+"""The independent checker: it accepts a certificate only if the theorem below follows from it, by exact arithmetic.
 
-`rtcd check FILE`, `python -m rtcd_jax.certificate.check FILE` or `python check.py FILE`. It knows no solver and nothing of
-the rest of the package: the standard library is enough, and python-flint makes it some ten times faster. Who wants to
-believe a certificate needs to believe this file alone.
+`rtcd check FILE`, `python -m rtcd_jax.certificate.check FILE` or `python check.py FILE`. It knows no solver and nothing
+of the rest of the package: the standard library is enough, and python-flint makes it faster. Who wants to believe a
+certificate needs to believe this file alone.
 
-THEOREM. Let the claim hold a robot x' = f(x, u) with D(x) f(x, u) = a(x) + b(x) u, where a, b, D are polynomials in x and
-in the sine and cosine of one angle (`PLANTS`), and its controller
+THEOREM. Let the claim hold a robot x' = f(x, u) with D(x) f(x, u) = a(x) + b(x) u, where a, b, D are polynomials in x
+and in the sine and cosine of one angle (`PLANTS`), and its controller
 
-    u = clip(u_k - K(t) (x - x*(t)), -F, F)  on [t_k, t_{k+1}],        u = clip(-K_g (x - x_g), -F, F)  after t_N,
+    u = clip(u_k - K(t) (x - x*(t)), -F, F)  on [t_k, t_{k+1}],      u = clip(-K_g (x - x_g), -F, F)  after t_N,
 
-with x* the cubic Hermite interpolant of the claimed states and rates, K linear between K_k and K_{k+1}. If this file accepts,
-then with E(t) = {x*(t) + L(t) y : |y| <= 1} and G = {x_g + L_g y : |y| <= 1} of the certificate, every motion that is in E(t)
-at some t of [start, t_N] stays in E until t_N, is then in G, never leaves G, and comes and stays as close to x_g as
-reported; and in E and G no state exceeds its limit.
+with x* the cubic Hermite interpolant of the claimed states and rates, K linear between K_k and K_{k+1}. If this file
+accepts, then with E(t) = {x*(t) + L(t) y : |y| <= 1} and G = {x_g + L_g y : |y| <= 1} of the certificate, every motion
+that is in E(t) at some t of [start, t_N] stays in E until t_N, is then in G, never leaves G, and comes and stays as
+close to x_g as reported; and in E and G no state exceeds its limit.
 
-PROOF. *Funnel.* In y, d/dt |y|^2 = 2 y'L^-1 (f - x*' - L'y). Let L = L(s), s in [-1, 1] the time of one interval, det L > 0 and
-D > 0. Then q = -2 c y' adj(L) (a + b u - D (x*' + L'y)), c > 0 a constant, is -d/dt |y|^2 times a positive function. On the
-sphere |y| = 1 one of three cases holds: |u_lin| <= F and u = u_lin, or u_lin >= F and u = F, or u_lin <= -F and u = -F. For
-each, q is a polynomial p(s, y) up to a remainder r (sine, cosine and every rounding enclosed), and the certificate gives
-p = sum_j B_j(s) p_j(y) in Bernstein polynomials with, modulo |y|^2 = 1,
+PROOF. *Funnel.* In y, d/dt |y|^2 = 2 y'L^-1 (f - x*' - L'y). Let L = L(s), s in [-1, 1] the time of one interval,
+det L > 0 and D > 0. Then q = -2 c y' adj(L) (a + b u - D (x*' + L'y)), with a constant c > 0, is -d/dt |y|^2 times a
+positive function. On the sphere |y| = 1 one of three cases holds: |u_lin| <= F and u = u_lin, or u_lin >= F and u = F,
+or u_lin <= -F and u = -F. For each, q is a polynomial p(s, y) up to a remainder r (sine, cosine and every rounding
+enclosed), and the certificate gives p = sum_j B_j(s) p_j(y) in Bernstein polynomials with, modulo |y|^2 = 1,
 
-    p_j = z'G_j z + sum_i (sigma_i g_i)_j + rest_j,   G_j > 0,   sigma_i = sum_a B_a(s) z'S_ia z,   S_ia > 0,
+    p_j = z'G_j z + sum_i (sigma_i g_i)_j + rest_j,    G_j > 0,    sigma_i = sum_a B_a(s) z'S_ia z,    S_ia > 0,
 
-g_i >= 0 the inequalities of the case. B_j >= 0 and sum_j B_j = 1, so that q >= min_j inf rest_j - r = margin > 0 on the case.
-So |y| decreases wherever |y| = 1: no motion leaves E (its right side is Lipschitz, its intervals join without a gap).
-*Goal.* The same with y = l z, |z| = 1, l in [0, 1] in the place of s, and q divided by l^2: the remainder of q is r l^2 + d l,
-where d bounds what does not vanish with l (x_g is a rounded multiple of pi). |y| decreases wherever l > d / margin. QED
+g_i >= 0 the inequalities of the case. B_j >= 0 and sum_j B_j = 1, so that q >= min_j inf rest_j - r = margin > 0 on the
+case. So |y| decreases wherever |y| = 1: no motion leaves E (its right side is Lipschitz in x, its intervals join
+without a gap).
+*Goal.* The same with y = l z, |z| = 1, l in [0, 1] in the place of s, and q divided by l^2: the remainder of q is
+r l^2 + d l, where d bounds what does not vanish with l (x_g is a rounded multiple of pi). |y| decreases wherever
+l > d / margin. QED
 
-Every number of a file is an exact double in hexadecimal notation. Digests show where a file was changed; the theorem does
-not rest on them.
+Every number of a file is an exact double in hexadecimal notation. Digests show where a file was changed; the theorem
+does not rest on them.
 """
 
 import hashlib
@@ -135,12 +137,12 @@ class Sparse:
 
 
 @lru_cache
-def _ring(n: int):
+def _ring(n: int) -> Any:
     names = ["s", *(f"y{i}" for i in range(n))]
     return flint.fmpq_mpoly_ctx.get(names, flint.Ordering.degrevlex)  # pyright: ignore[reportOptionalMemberAccess]
 
 
-def polynomial(n: int, terms: Mapping[tuple[int, ...], Any]):
+def polynomial(n: int, terms: Mapping[tuple[int, ...], Any]) -> Any:
     """The polynomial with these coefficients by exponents (of s, y_1 .. y_n)."""
     return _ring(n).from_dict(dict(terms)) if flint else Sparse(terms)
 
@@ -163,7 +165,7 @@ def size(p):
 
 
 class Taylor:
-    """A function of (s, y) within d + r s of the polynomial p, for |y| <= 1 (s = 1 along a funnel, s = l at the goal)."""
+    """A function of (s, y) within d + r s of the polynomial p, for |y| <= 1; s = l at the goal, 1 along a funnel."""
 
     __slots__ = ("d", "p", "r", "space")
 
@@ -255,8 +257,10 @@ def _chebyshev(k: int) -> tuple[int, ...]:
 
 
 _LONG = 31
-_SINE = [Q(0) if k % 2 else Q((-1) ** (k // 2), math.factorial(k + 1)) for k in range(_LONG)]  # sin(x) / x
-_COSINE = [Q((-1) ** ((k + 1) // 2), math.factorial(k + 1)) if k % 2 else Q(0) for k in range(_LONG)]  # (cos(x) - 1) / x
+_SINE = [Q(0) if k % 2 else Q((-1) ** (k // 2), math.factorial(k + 1)) for k in range(_LONG)]
+"""Of sin(x) / x."""
+_COSINE = [Q((-1) ** ((k + 1) // 2), math.factorial(k + 1)) if k % 2 else Q(0) for k in range(_LONG)]
+"""Of (cos(x) - 1) / x."""
 
 
 def sine_and_cosine(angle: Taylor, center, values: tuple, place: str) -> tuple[Taylor, Taylor]:
@@ -316,7 +320,13 @@ def _cartpole(p, x, sine, cosine):
 
 PLANTS = {
     "pendulum": Plant(
-        ("theta", "theta_dot"), ("rad", "rad/s"), "N m", 0, "torque_limit", ("m", "l", "b", "g", "torque_limit"), _pendulum
+        ("theta", "theta_dot"),
+        ("rad", "rad/s"),
+        "N m",
+        0,
+        "torque_limit",
+        ("m", "l", "b", "g", "torque_limit"),
+        _pendulum,
     ),
     "cartpole": Plant(
         ("cart", "theta", "cart_dot", "theta_dot"),
@@ -328,6 +338,9 @@ PLANTS = {
         _cartpole,
     ),
 }
+
+
+SINGULAR = "the mass matrix' determinant is not shown to be positive"
 
 
 class Claim(NamedTuple):
@@ -625,11 +638,12 @@ def funnel_obligations(claim: Claim, piece: Stretch, place: str) -> dict[str, Ob
     x = [Taylor(space, space.poly(data.state[i]) + error[i]).tidy() for i in every]
     angle = x[claim.plant.angle]
     center, _ = near(angle.constant, 20)
+    insist(abs(center) <= 64, place, "the nominal angle is beyond 64 rad")
     values = alternating(center, 1), alternating(center, 0)
     sine, cosine = sine_and_cosine(angle, center, (values[0][0], values[1][0], values[0][1]), place)
     d, a, b = claim.plant.field(claim.parameters, x, sine, cosine)
     d0 = d.constant
-    insist(2 * d0 - size(d.p) - d.r - d.d > 0, place, "the mass matrix' determinant is not shown to be positive")
+    insist(2 * d0 - size(d.p) - d.r - d.d > 0, place, SINGULAR)
     wide = space._replace(y_order=space.y_order + 1)
     scale, _ = near(2 / (d0 * determinant[0]), 30)
     push = [Taylor(wide, _sum(space, (space.poly(adjugate[i][j]) * y[i] for i in every))) * scale for j in every]
@@ -722,10 +736,10 @@ def goal_field(claim: Claim, axes: list, y_order: int, place: str) -> tuple[Tayl
     off = abs(center - PI * turns) + PI_ERROR * abs(turns)
     insist(off < Q(1, 10**9), place, "the goal's angle is no multiple of pi")
     x = [Taylor(space, space.poly(c) + e) for c, e in zip(claim.x_goal, error, strict=True)]
-    values = (Q(0), Q((-1) ** turns), off / 3)
+    values = (Q(0), Q(-1 if turns % 2 else 1), off / 3)
     sine, cosine = sine_and_cosine(x[claim.plant.angle], center, values, place)
     d, a, b = claim.plant.field(claim.parameters, x, sine, cosine)
-    insist(2 * d.constant - size(d.p) - d.r - d.d > 0, place, "the mass matrix' determinant is not shown to be positive")
+    insist(2 * d.constant - size(d.p) - d.r - d.d > 0, place, SINGULAR)
     scale, _ = near(2 / (d.constant * determinant[0]), 30)
     wide = space._replace(y_order=y_order + 1)
     push = [Taylor(wide, _sum(space, (z[i] * adjugate[i][j][0] for i in every)) * scale) for j in every]
@@ -949,38 +963,46 @@ def check_chain(claim: Claim, pieces: Sequence[Stretch], place: str) -> None:
     """The intervals cover [start, t_N] without gap or overlap, and their ellipsoids join."""
     reached, axes = claim.start, None
     for i, piece in enumerate(pieces):
-        here, at = f"{place}[{i}]", reached[0] + reached[1]
-        begins = piece.knot + piece.start
-        insist(begins <= at, here, f"leaves a gap: starts at {float(begins):.17g} knots, must start at {float(at):.17g}")
-        insist(begins == at, here, f"overlaps: starts at {float(begins):.17g} knots, must start at {float(at):.17g}")
+        here, at, begins = f"{place}[{i}]", reached[0] + reached[1], piece.knot + piece.start
+        where = f"starts at {float(begins):.17g} knots, must start at {float(at):.17g}"
+        insist(begins <= at, here, f"leaves a gap: {where}")
+        insist(begins == at, here, f"overlaps: {where}")
         insist(axes is None or axes == piece.first, f"{here}.first", "is not where the interval before it ends")
         reached, axes = (piece.knot, piece.end), piece.last
     insist(reached[0] + reached[1] == len(claim.u), place, "does not reach the last knot")
 
 
+def read_goal(node: Node, claim: Claim) -> tuple[list, int, Any, list[Shell]]:
+    """Axes, order of the Taylor models, weight of the S-lemma, and the shells, which cover the levels [0, 1]."""
+    axes, order, weight, items = node.keys("axes", "order", "weight", "shells")
+    shells, reached = [read_shell(item, claim.n) for item in items.items(at_least=1)], Q(0)
+    node.sealed()
+    for i, shell in enumerate(shells):
+        place = f"{items.place}[{i}]"
+        insist(shell.start == reached, place, f"starts at {float(shell.start):g}, must start at {float(reached):g}")
+        reached = shell.end
+    items.insist(reached == 1, f"ends at {float(reached):g}, must end at 1")
+    return axes.array(claim.n, claim.n), order.integer(2, MAX_ORDER - 2), weight.number(), shells
+
+
 def check_goal(claim: Claim, node: Node, outlet: list) -> tuple[list, list, int, Any]:
     """Axes of the goal region, how close motions come [n], the number of shells and the least margin."""
-    axes, order, weight, shells = node.keys("axes", "order", "weight", "shells")
-    node.sealed()
-    l_goal, n = axes.array(claim.n, claim.n), claim.n
+    axes, order, weight, shells = read_goal(node, claim)
     for i, bound in enumerate(claim.bounds):
         left = None if bound is None else bound - abs(claim.x_goal[i])
-        kept = left is None or (left > 0 and left * left > _square([[c] for c in l_goal[i]])[0])
-        axes.insist(kept, f"a limit on {claim.plant.states[i]} is not kept")
-    insist_arrival(claim, outlet, l_goal, weight.number(), axes.place)
-    field = goal_field(claim, l_goal, order.integer(2, MAX_ORDER - 2), node.place)
-    reached, least, drift = Q(0), None, Q(0)
-    for item in shells.items(at_least=1):
-        shell = read_shell(item, n)
-        item.insist(shell.start == reached, f"starts at {float(shell.start):g}, must start at {float(reached):g}")
+        kept = left is None or (left > 0 and left * left > _square([[c] for c in axes[i]])[0])
+        insist(kept, f"{node.place}.axes", f"the limit on |{claim.plant.states[i]}| is not kept")
+    field = goal_field(claim, axes, order, node.place)
+    insist_arrival(claim, outlet, axes, weight, f"{node.place}.axes")
+    least, drift = None, Q(0)
+    for i, shell in enumerate(shells):
         todo = goal_obligations(claim, field, shell.start, shell.end)
-        found = min(margins(todo, shell.cases, f"{item.place}.cases").values())
-        least, reached = (found if least is None else min(least, found)), shell.end
+        found = min(margins(todo, shell.cases, f"{node.place}.shells[{i}].cases").values())
+        least = found if least is None else min(least, found)
         drift = max(drift, *(each.drift for each in todo.values()))
-    shells.insist(reached == 1, f"ends at {float(reached):g}, must end at 1")
     rest = drift / least
-    shells.insist(rest < 1, "the rounding of the goal is too large for a proof")
-    return l_goal, [rest * root_up(_square([[c] for c in row])[0]) for row in l_goal], len(shells.value), least
+    insist(rest < 1, node.place, "the rounding of the goal is too large for a proof")
+    return axes, [rest * root_up(_square([[c] for c in row])[0]) for row in axes], len(shells), least
 
 
 def check(content: Any, progress: Callable[[int, int], None] = lambda done, of: None) -> Report:
@@ -1038,27 +1060,26 @@ def volumes_of(
 
 def sentence(name: str, report: Report) -> str:
     """What is proved, in plain words."""
-    claim, plant = report.claim, report.claim.plant
+    claim, plant, v = report.claim, report.claim.plant, report.volumes
     numbers = ", ".join(f"{key} = {float(value):.6g}" for key, value in claim.parameters.items())
     unit = " ".join(plant.units)
 
-    def extent(values) -> str:
-        triples = zip(plant.states, values, plant.units, strict=True)
-        return ", ".join(f"{state} +-{value:.3g} {unit}" for state, value, unit in triples)
+    def extent(place: str) -> str:
+        triples = zip(plant.states, report.axes[place], plant.units, strict=True)
+        return f"{place} " + ", ".join(f"{state} +-{value:.3g} {unit}" for state, value, unit in triples)
 
-    kept = [f"|{s}| <= {float(b):.6g} {u}" for s, b, u in zip(plant.states, claim.bounds, plant.units, strict=True) if b]
-    v = report.volumes
+    limits = [(s, b, u) for s, b, u in zip(plant.states, claim.bounds, plant.units, strict=True) if b is not None]
+    kept = " and ".join(f"|{state}| <= {float(bound):.6g} {unit}" for state, bound, unit in limits)
     return (
-        f"PROVED in continuous time, by exact arithmetic, for the model {name!r} ({numbers}; SI units) under the claimed "
-        f"controller, whose input never exceeds {float(claim.limit):.6g} {plant.input_unit}: every motion that is in the "
-        f"funnel at some time of [{report.start:.6g} s, {report.end:.6g} s] stays in it, is in the goal region at "
-        f"{report.end:.6g} s, never leaves that region, and comes to rest within {max(report.rest):.1g} of the goal in every "
-        f"state; {' and '.join(kept) or 'no limit on a state'} all the while. Half widths: inlet {extent(report.axes['inlet'])}; "
-        f"outlet {extent(report.axes['outlet'])}; goal region {extent(report.axes['goal'])}. Volumes (proved) [{unit}]: "
-        f"inlet {v['inlet']:.6g}, sum over the knots {v['sum']:.6g}, integral over time {v['integral']:.6g} s, goal region "
-        f"{v['goal']:.6g}. {report.stretches} intervals of time and {report.shells} of level, smallest margin "
-        f"{report.margin:.2g}. It is a statement about this model, its state known and its input continuous, not about "
-        "hardware."
+        f"PROVED in continuous time, by exact arithmetic, for the model {name!r} ({numbers}; SI units) under the "
+        f"claimed controller, whose input never exceeds {float(claim.limit):.6g} {plant.input_unit}: every motion that "
+        f"is in the funnel at some time of [{report.start:.6g} s, {report.end:.6g} s] stays in it, is in the goal region at "
+        f"{report.end:.6g} s, never leaves that region, and comes to rest within {max(report.rest):.1g} of the goal in "
+        f"every state; {kept or 'there is no limit on a state'} all the while. Half widths: {extent('inlet')}; "
+        f"{extent('outlet')}; {extent('goal')}. Volumes (proved) [{unit}]: inlet {v['inlet']:.6g}, sum over the knots "
+        f"{v['sum']:.6g}, integral over time {v['integral']:.6g} s, goal region {v['goal']:.6g}. {report.stretches} "
+        f"intervals of time and {report.shells} of level, smallest margin {report.margin:.2g}. It is a statement about "
+        "this model, its state known and its input continuous, not about hardware."
     )
 
 

@@ -5,7 +5,7 @@ spare rate; the limits on the states cap it. The program then has only to verify
 raised, the interval halved, and the rate raised again.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from typing import NamedTuple, final
 
 import numpy as np
@@ -29,6 +29,8 @@ TIERS = {2: ((5, 3), (7, 4)), 4: ((3, 2), (5, 3))}
 """By the number of states: orders in y of Taylor models and degrees of monomials, the cheapest first."""
 ERROR_SHARE = 1 / 3
 """A Taylor model is good enough if its error is at most this share of the spare rate."""
+COLLAPSE = 1e-3
+"""Share of its level that a funnel must keep within an interval."""
 BOX_SHARE = 0.999
 """Share of the level at which an ellipsoid would touch a limit."""
 DIRECTIONS = {2: 720, 4: 4000}
@@ -109,8 +111,8 @@ class Descent:
         return None
 
     def _attempt(self, k: int, start: float, end: float, front: Front, spare: float) -> Proved | None:
-        piece, rho = self._piece(k, start, end, front, spare)
         try:
+            piece, rho = self._piece(k, start, end, front, spare)
             check.insist_bounds(self.claim, check.motion(self.claim, piece), "limits")
             piece, todo, degree = self._models(piece, spare)
             found = prove(todo, degree, piece.orders[0], self.exact)
@@ -121,7 +123,7 @@ class Descent:
         return Proved(piece._replace(cases=found[0]), rho, spare, found[1])
 
     def _piece(self, k: int, start: float, end: float, front: Front, spare: float) -> tuple[Stretch, float]:
-        """The interval's ellipsoids, from the front's level and the spare rate."""
+        """The interval's ellipsoids, from the front's level and the spare rate; Refused if the level vanishes."""
         loop, duration = self.loop, (end - start) * self.loop.dt
         rho, last = self._level(k, start, end, front.rho, spare)
         first_growth, last_growth = self._growth(k, start, rho, spare), last
@@ -134,38 +136,39 @@ class Descent:
         chord = (b - a) / 2
         at_start, at_end = (a_rate * duration / 2 - chord) / 2, (chord - b_rate * duration / 2) / 2
         bend = [on_grid((at_end + at_start) / 2), on_grid((at_end - at_start) / 2)]
-        share = [Q(*s.as_integer_ratio()) for s in (start, end)]
+        shares = Q(*start.as_integer_ratio()), Q(*end.as_integer_ratio())
         order = TIERS[self.claim.n][0][0]
-        return Stretch(k, *share, on_grid(a), front.axes, bend, (TIME_ORDER, order), {}), rho
+        return Stretch(k, *shares, on_grid(a), front.axes, bend, (TIME_ORDER, order), {}), rho
 
     def _growth(self, k: int, share: float, rho: float, spare: float) -> float:
         return self.loop.growth(k, share, rho, self._directions) + spare
 
     def _level(self, k: int, start: float, end: float, rho: float, spare: float) -> tuple[float, float]:
         """The level at the start by Heun's method on its logarithm, and the growth at the end."""
-        step, share = (end - start) / HEUN_STEPS, end
+        step, share, level = (end - start) / HEUN_STEPS, end, rho
         at_end = slope = self._growth(k, end, rho, spare)
         for i in range(HEUN_STEPS):
             share = end - (i + 1) * step
             guess = rho * np.exp(-step * self.loop.dt * slope)
             rho *= np.exp(-step * self.loop.dt * (slope + self._growth(k, share, guess, spare)) / 2)
+            if rho < COLLAPSE * level:
+                raise Refused("interval", "the level vanishes")
             slope = self._growth(k, share, rho, spare)
         return float(rho), at_end
 
     def _models(self, piece: Stretch, spare: float) -> tuple[Stretch, dict[str, Obligation], int]:
         """The interval's obligations by the cheapest Taylor models that are good enough."""
-        tiers = TIERS[self.claim.n]
-        for order, degree in tiers:
-            piece = piece._replace(orders=(piece.orders[0], order))
-            todo = check.funnel_obligations(self.claim, piece, "interval")
+        *cheaper, (order, degree) = TIERS[self.claim.n]
+        for order_here, degree_here in cheaper:
+            attempt = piece._replace(orders=(TIME_ORDER, order_here))
+            todo = check.funnel_obligations(self.claim, attempt, "interval")
             if max(float(each.error) for each in todo.values()) <= ERROR_SHARE * spare:
-                break
-        return piece, todo, degree
+                return attempt, todo, degree_here
+        piece = piece._replace(orders=(TIME_ORDER, order))
+        return piece, check.funnel_obligations(self.claim, piece, "interval"), degree
 
 
-def prove(
-    todo: dict[str, Obligation], degree: int, order: int, exact: bool
-) -> tuple[dict[str, Witness], float] | None:
+def prove(todo: dict[str, Obligation], degree: int, order: int, exact: bool) -> tuple[dict[str, Witness], float] | None:
     """Witnesses by case and the least margin; None where a case has none. `exact`: the checker's margin.
 
     Raises:
@@ -181,6 +184,3 @@ def prove(
         margin = float(check.margin(each, found.witness, case)) if exact else found.margin
         least = min(least, margin)
     return witnesses, least
-
-
-Recorder = Callable[[Proved], None]

@@ -11,7 +11,7 @@ from rtcd_jax.errors import UserError
 
 def double(value: float) -> str:
     """A double as certificates write it."""
-    return float(value).hex().replace("0x0.0p+0", "0x0.0p+0")
+    return float(value).hex()
 
 
 def doubles(values: Any) -> Any:
@@ -97,8 +97,8 @@ class Loop:
     def _linear(self, x: np.ndarray, u: float) -> tuple[np.ndarray, np.ndarray]:
         """A and B, by complex steps."""
         step = 1e-30
-        a = self.rate(x[:, None] + 1j * step * np.eye(self.n), u).imag / step
-        return a, self.rate(x.astype(complex), u + 1j * step).imag / step
+        a = np.imag(self.rate(x[:, None] + 1j * step * np.eye(self.n), u)) / step
+        return a, np.imag(self.rate(x.astype(complex), u + 1j * step)) / step
 
     def nominal(self, k: int, share: float) -> tuple[np.ndarray, np.ndarray]:
         """x* and x*' at a share of the interval k."""

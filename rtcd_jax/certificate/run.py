@@ -1,5 +1,6 @@
 """`rtcd certify`: elites of a run folder in parallel processes, one line of progress, a table at the end."""
 
+import contextlib
 import io
 import multiprocessing
 import os
@@ -43,8 +44,8 @@ class Progress:
         step, share = self.step, self.generation / self.generations
         left = self.elapsed * (1 - share) / share if share else float("nan")
         return (
-            f"elite {step.elite}  interval {step.knot + 1}/{step.knots}  back to t = {step.time:.3f} s  rho {step.rho:.4g}"
-            f"  margin {step.margin:.2g}/s  elapsed {self.elapsed:.0f} s  left {left:.0f} s"
+            f"elite {step.elite}  interval {step.knot + 1}/{step.knots}  back to t = {step.time:.3f} s"
+            f"  rho {step.rho:.4g}  margin {step.margin:.2g}/s  elapsed {self.elapsed:.0f} s  left {left:.0f} s"
         )
 
 
@@ -79,9 +80,7 @@ def certify_run(folder: Path, elites: int, rung: str, workers: int, console: Con
     return all(outcome is not None and outcome.whole for outcome in outcomes.values())
 
 
-def _events(
-    folder: Path, names: Sequence[str], rung: str, workers: int
-) -> Iterator[Step | tuple[str, Outcome | None]]:
+def _events(folder: Path, names: Sequence[str], rung: str, workers: int) -> Iterator[Step | tuple[str, Outcome | None]]:
     """Steps of all elites as they come, and every elite's outcome by its name."""
     context = multiprocessing.get_context("spawn")
     steps = context.Queue()
@@ -90,10 +89,8 @@ def _events(
         waiting: dict[Future, str] = {pool.submit(_work, folder, name, rung): name for name in names}
         try:
             while waiting:
-                try:
+                with contextlib.suppress(queue.Empty):
                     yield steps.get(timeout=POLL)
-                except queue.Empty:
-                    pass
                 for future in [future for future in waiting if future.done()]:
                     yield waiting.pop(future), future.result()
         finally:
@@ -121,7 +118,7 @@ def _summary(outcome: Outcome | None) -> dict[str, Any] | None:
 def _table(outcomes: Sequence[Outcome], rung: str) -> str:
     table = Table(box=SIMPLE, title=f"volumes: sampled / {rung}")
     table.add_column("elite")
-    for heading in ("from [s]", "intervals", "seconds", "inlet", "sum", "ratio of sums", "integral", "goal"):
+    for heading in ("from, s", "intervals", "took, s", "inlet", "sum", "ratio of sums", "integral", "goal"):
         table.add_column(heading, justify="right")
     for outcome in outcomes:
         pairs = {key: f"{value:.4g} / {outcome.found[key]:.4g}" for key, value in outcome.sampled.items()}
