@@ -1074,11 +1074,12 @@ def sentence(name: str, report: Report) -> str:
         f"PROVED in continuous time, by exact arithmetic, for the model {name!r} ({numbers}; SI units) under the "
         f"claimed controller, whose input never exceeds {float(claim.limit):.6g} {plant.input_unit}: every motion that "
         f"is in the funnel at some time of [{report.start:.6g} s, {report.end:.6g} s] stays in it, is in the goal "
-        f"region at {report.end:.6g} s, never leaves that region, and comes to rest within {max(report.rest):.1g} of the goal in "
-        f"every state; {kept or 'there is no limit on a state'} all the while. Half widths: {extent('inlet')}; "
-        f"{extent('outlet')}; {extent('goal')}. Volumes (proved) [{unit}]: inlet {v['inlet']:.6g}, sum over the knots "
-        f"{v['sum']:.6g}, integral over time {v['integral']:.6g} s, goal region {v['goal']:.6g}. {report.stretches} "
-        f"intervals of time and {report.shells} of level, smallest margin {report.margin:.2g}. It is a statement about "
+        f"region at {report.end:.6g} s, never leaves that region, and comes to rest within {max(report.rest):.1g} of "
+        f"the goal in every state; {kept or 'there is no limit on a state'} all the while. Half widths: "
+        f"{extent('inlet')}; {extent('outlet')}; {extent('goal')}. Volumes (proved) [{unit}]: inlet {v['inlet']:.6g}, "
+        f"sum over the knots {v['sum']:.6g}, integral over time {v['integral']:.6g} s, goal region {v['goal']:.6g}. "
+        f"{report.stretches} intervals of time and {report.shells} of level, smallest margin {report.margin:.2g}. It is "
+        "a statement about "
         "this model, its state known and its input continuous, not about hardware."
     )
 
