@@ -1078,8 +1078,8 @@ def sentence(name: str, report: Report) -> str:
         f"the goal in every state; {kept or 'there is no limit on a state'} all the while. Half widths: "
         f"{extent('inlet')}; {extent('outlet')}; {extent('goal')}. Volumes (proved) [{unit}]: inlet {v['inlet']:.6g}, "
         f"sum over the knots {v['sum']:.6g}, integral over time {v['integral']:.6g} s, goal region {v['goal']:.6g}. "
-        f"{report.stretches} intervals of time and {report.shells} of level, smallest margin {report.margin:.2g}. It is "
-        "a statement about "
+        f"{report.stretches} intervals of time and {report.shells} of level, smallest margin {report.margin:.2g}. It "
+        "is a statement about "
         "this model, its state known and its input continuous, not about hardware."
     )
 
