@@ -16,8 +16,8 @@ from rtcd_jax.certificate.loop import Loop
 
 GRID = 34
 """Ellipsoids are rounded to multiples of 2^-34."""
-SPARE = (0.005, 0.015, 0.04, 0.1)
-"""Rates [1/s] that the level gives away, in the order of trial, before an interval is halved."""
+SPARE = {2: (0.005, 0.015, 0.04, 0.1), 4: (0.02, 0.06, 0.2, 0.5)}
+"""By the number of states: rates [1/s] that a level gives away, in the order of trial, before an interval is halved."""
 LARGE_SPARE = (0.25, 0.6, 1.5, 4.0, 10.0, 25.0)
 """And for an interval of the shortest share."""
 SHORTEST = 1 / 16
@@ -98,12 +98,18 @@ class Descent:
                 waiting += [(k, start, middle), (k, middle, end)]
                 continue
             spare, proved = found
-            front = Front(k, start, proved.rho, proved.piece.first, max(spare - 1, 0))
+            front = Front(k, start, proved.rho, proved.piece.first, self.next_trial(spare, proved.margin))
             yield proved
+
+    def next_trial(self, place: int, margin: float) -> int:
+        """The place of the spare rate that the next interval begins with: a lower one if the margin allows it."""
+        rates = SPARE[self.claim.n]
+        place = min(place, len(rates) - 1)
+        return place - 1 if place and margin > rates[place] - rates[place - 1] else place
 
     def _first(self, k: int, start: float, end: float, front: Front, short: bool) -> tuple[int, Proved] | None:
         """The least spare rate, by its place, with which the interval goes through."""
-        rates = SPARE + (LARGE_SPARE if short else ())
+        rates = SPARE[self.claim.n] + (LARGE_SPARE if short else ())
         for place in range(min(front.spare, len(rates) - 1), len(rates)):
             proved = self._attempt(k, start, end, front, rates[place])
             if proved is not None:
@@ -115,7 +121,7 @@ class Descent:
             piece, rho = self._piece(k, start, end, front, spare)
             check.insist_bounds(self.claim, check.motion(self.claim, piece), "limits")
             piece, todo, degree = self._models(piece, spare)
-            found = prove(todo, degree, piece.orders[0], self.exact)
+            found = prove(todo, degree, piece.orders[0], self.exact, self._directions)
         except Refused:
             return None
         if found is None:
@@ -168,16 +174,25 @@ class Descent:
         return piece, check.funnel_obligations(self.claim, piece, "interval"), degree
 
 
-def prove(todo: dict[str, Obligation], degree: int, order: int, exact: bool) -> tuple[dict[str, Witness], float] | None:
+def prove(
+    todo: dict[str, Obligation], degree: int, order: int, exact: bool, aims: np.ndarray
+) -> tuple[dict[str, Witness], float] | None:
     """Witnesses by case and the least margin; None where a case has none. `exact`: the checker's margin.
+
+    The directions `aims` [n D] are tried before a program is solved.
 
     Raises:
         Refused: the checker does not accept a witness of the solver's.
     """
     witnesses, least = {}, np.inf
+    shapes = {
+        case: program.shape_of(each, degree, order, MULTIPLIER if each.where else 0) for case, each in todo.items()
+    }
+    data = {case: program.data_of(each, shapes[case]) for case, each in todo.items()}
+    if any(program.lowest(data[case], shapes[case], aims) <= 0 for case in todo):
+        return None
     for case, each in todo.items():
-        multiplier = MULTIPLIER if each.where else 0
-        found = program.solve(each, program.shape_of(each, degree, order, multiplier))
+        found = program.solve(data[case], shapes[case])
         if found is None:
             return None
         witnesses[case] = found.witness

@@ -89,7 +89,9 @@ def certify_elite(run: Path, name: str, rung: str, on_step: Callable[[Step], Non
     front = _front(descent, claim, outlet, journal)
     for proved in descent.down_from(front):
         piece = proved.piece
-        journal.append({"stretch": _stretch_record(piece), "rho": proved.rho, "spare": proved.spare})
+        journal.append(
+            {"stretch": _stretch_record(piece), "rho": proved.rho, "spare": proved.spare, "margin": proved.margin}
+        )
         at = (piece.knot + float(piece.start)) * loop.dt
         on_step(Step(name, piece.knot, len(loop.u), at, proved.rho, proved.margin))
     seconds = time.perf_counter() - began
@@ -155,8 +157,10 @@ def _front(descent: Descent, claim: Claim, outlet: float, journal: Journal) -> F
     for line in journal.lines:
         if "stretch" in line:
             piece = check.read_stretch(Node("journal", line["stretch"]), claim)
-            spare = SPARE.index(line["spare"]) if line["spare"] in SPARE else len(SPARE) - 1
-            front = Front(piece.knot, float(piece.start), line["rho"], piece.first, max(spare - 1, 0))
+            rates = SPARE[claim.n]
+            place = rates.index(line["spare"]) if line["spare"] in rates else len(rates) - 1
+            trial = descent.next_trial(place, line["margin"])
+            front = Front(piece.knot, float(piece.start), line["rho"], piece.first, trial)
     return front
 
 

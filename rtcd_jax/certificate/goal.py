@@ -40,13 +40,13 @@ def goal_region(claim: Claim, loop: Loop, exact: bool) -> GoalRegion | None:
     falls = np.array([loop.goal_growth(level, aims) < 0 for level in levels])
     most = levels[-1] if falls.all() else levels[max(np.argmin(falls) - 1, 0)]
     for share in LADDER:
-        found = _at_level(claim, loop, float(share * most), exact)
+        found = _at_level(claim, loop, float(share * most), exact, aims)
         if found is not None:
             return found
     return None
 
 
-def _at_level(claim: Claim, loop: Loop, rho: float, exact: bool) -> GoalRegion | None:
+def _at_level(claim: Claim, loop: Loop, rho: float, exact: bool, aims: np.ndarray) -> GoalRegion | None:
     last, order = len(loop.u) - 1, ORDERS[claim.n]
     axes = on_grid(loop.axes(last, 1.0, rho, 0.0)[0])
     degree, waiting, shells, least = (order + 2) // 2, [(0.0, 1.0)], [], np.inf
@@ -56,7 +56,7 @@ def _at_level(claim: Claim, loop: Loop, rho: float, exact: bool) -> GoalRegion |
             start, end = waiting.pop()
             share = Q(*start.as_integer_ratio()), Q(*end.as_integer_ratio())
             todo = check.goal_obligations(claim, field, *share)
-            found = prove(todo, degree, order + 1, exact)
+            found = prove(todo, degree, order + 1, exact, aims)
             if found is not None:
                 shells.append(Shell(*share, found[0]))
                 least = min(least, found[1])

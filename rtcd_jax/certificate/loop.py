@@ -1,12 +1,16 @@
 """An elite as a certificate sees it: the claim of its closed loop, and the same loop in float64 to search with."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any, final
 
 import numpy as np
 
 from rtcd_jax.certificate import check
 from rtcd_jax.errors import UserError
+
+CLIMBERS, TRIES = 8, 40
+CLIMBS = (0.2, 0.1, 0.05, 0.02)
+"""Best directions of a sphere that are improved by so many random steps of these lengths."""
 
 
 def double(value: float) -> str:
@@ -117,19 +121,24 @@ class Loop:
         c = np.linalg.cholesky(p[np.ix_(order, order)])
         inner = np.linalg.solve(c, np.linalg.solve(c, p_rate[np.ix_(order, order)]).T)
         c_rate = c @ (np.tril(inner, -1) + np.diag(np.diag(inner)) / 2)
-        back = np.argsort(order)
-        return c[back], c_rate[back]
+        back, sign = np.argsort(order), np.ones(self.n)
+        sign[-1] = np.linalg.det(np.eye(self.n)[order])  # of the permutation: det L > 0
+        return c[back] * sign, c_rate[back] * sign
 
     def growth(self, k: int, share: float, rho: float, directions: np.ndarray) -> float:
-        """The largest V' / V over the sampled directions [n D] of the surface V = rho."""
+        """The largest V' / V over the surface V = rho, looked for from the sampled directions [n D]."""
         s, slope = self.value(k, share)
         axes, _ = self.axes(k, share, rho, 0.0)
         center, center_rate = self.nominal(k, share)
         gain = (1 - share) * self.gains[k] + share * self.gains[k + 1]
-        error = axes @ directions
-        u = np.clip(self.u[k] - gain @ error, -self.limit, self.limit)
-        fall = self.rate(center[:, None] + error, u) - center_rate[:, None]
-        return float(np.max(np.sum((s @ error) * (2 * fall) + error * (slope @ error), axis=0)) / rho)
+
+        def rises(y: np.ndarray) -> np.ndarray:
+            error = axes @ y
+            u = np.clip(self.u[k] - gain @ error, -self.limit, self.limit)
+            fall = self.rate(center[:, None] + error, u) - center_rate[:, None]
+            return np.sum((s @ error) * (2 * fall) + error * (slope @ error), axis=0) / rho
+
+        return _highest(rises, directions)
 
     def box_level(self, k: int, share: float) -> float:
         """The level of the ellipsoid that touches a limit on the states."""
@@ -146,9 +155,28 @@ class Loop:
         """As `growth`, about the goal."""
         s = self.values[-1]
         axes = np.linalg.cholesky(np.linalg.inv(s) * rho)
-        error = axes @ directions
-        u = np.clip(-self.goal_gain @ error, -self.limit, self.limit)
-        return float(np.max(2 * np.sum((s @ error) * self.rate(self.goal[:, None] + error, u), axis=0)) / rho)
+
+        def rises(y: np.ndarray) -> np.ndarray:
+            error = axes @ y
+            u = np.clip(-self.goal_gain @ error, -self.limit, self.limit)
+            return 2 * np.sum((s @ error) * self.rate(self.goal[:, None] + error, u), axis=0) / rho
+
+        return _highest(rises, directions)
+
+
+def _highest(f: Callable[[np.ndarray], np.ndarray], directions: np.ndarray) -> float:
+    """The largest f over the sphere: the best directions [n D], then random steps around them, ever shorter."""
+    values = f(directions)
+    if len(directions) == 2:  # a circle is covered densely
+        return float(values.max())
+    random, best = np.random.default_rng(0), directions[:, np.argsort(values)[-CLIMBERS:]]
+    for reach in CLIMBS:
+        tries = best[:, :, None] + reach * random.normal(size=(*best.shape, TRIES))
+        tries = np.concatenate([best[:, :, None], tries], axis=2)
+        tries /= np.linalg.norm(tries, axis=0)
+        values = f(tries.reshape(len(best), -1)).reshape(best.shape[1], -1)
+        best = np.take_along_axis(tries, values.argmax(axis=1)[None, :, None], axis=2)[:, :, 0]
+    return float(values.max())
 
 
 def _floats(values: Any) -> Any:

@@ -28,6 +28,7 @@ GRID = 44
 """Witnesses are rounded to multiples of 2^-44, so that the checker's integers stay short."""
 LIFT = 2.0**-36
 """Added to every diagonal: the solver's matrices are positive definite up to its tolerance only."""
+SAMPLED_TIMES = 7
 SQRT2 = math.sqrt(2)
 
 
@@ -136,11 +137,34 @@ def _multiplier_blocks(shape: Shape, g: np.ndarray) -> list[list[sp.csc_matrix]]
     return blocks
 
 
-def solve(todo: Obligation, shape: Shape) -> Solved | None:
+def lowest(data: Data, shape: Shape, y: np.ndarray) -> float:
+    """The least p - error over sampled times and those directions y [n D] where all g >= 0: no margin is larger."""
+    powers = _powers(shape.n, 2 * shape.degree, y)
+    p, conditions = data.p @ powers, [g @ powers[: g.shape[1]] for g in data.g]
+    least = np.inf
+    for t in np.linspace(0, 1, SAMPLED_TIMES):
+        holds = np.ones(y.shape[1], bool)
+        for g in conditions:
+            holds &= _weights(len(g) - 1, t) @ g >= 0
+        least = min(least, float(np.min((_weights(len(p) - 1, t) @ p)[holds], initial=np.inf)))
+    return least
+
+
+def _powers(n: int, degree: int, y: np.ndarray) -> np.ndarray:
+    """Monomials [M D] at the directions y [n D]."""
+    table = np.cumprod(np.concatenate([np.ones((1, *y.shape)), np.repeat(y[None], degree, axis=0)]), axis=0)
+    return np.array([np.prod([table[e, i] for i, e in enumerate(m)], axis=0) for m in check.monomials(n, degree)])
+
+
+def _weights(degree: int, t: float) -> np.ndarray:
+    """The Bernstein polynomials at t in [0, 1]."""
+    return np.array([math.comb(degree, j) * t**j * (1 - t) ** (degree - j) for j in range(degree + 1)])
+
+
+def solve(data: Data, shape: Shape) -> Solved | None:
     """The best witness by Clarabel; None where the solver has none, or no positive margin."""
     import clarabel
 
-    data = data_of(todo, shape)
     gram, parts = _gram_map(shape.n, shape.degree), shape.bernstein + 1
     rows, multipliers = gram.shape[0], _multiplier_blocks(shape, data.g)
     constant = np.zeros((rows, 1))

@@ -20,7 +20,8 @@ def anywhere(p, low=0.0, high=1.0):
 
 def shown(todo, degree, bernstein=0, multiplier=0):
     """The margin that the checker accepts, or None."""
-    found = program.solve(todo, program.shape_of(todo, degree, bernstein, multiplier))
+    shape = program.shape_of(todo, degree, bernstein, multiplier)
+    found = program.solve(program.data_of(todo, shape), shape)
     return None if found is None else float(check.margin(todo, found.witness, "theorem"))
 
 
@@ -134,7 +135,8 @@ def test_a_program_is_compiled_once():
 
 def test_an_error_is_taken_from_the_margin():
     todo = cubic(0.5)
-    found = program.solve(todo, program.shape_of(todo, 1, 2, 0))
+    shape = program.shape_of(todo, 1, 2, 0)
+    found = program.solve(program.data_of(todo, shape), shape)
     assert float(check.margin(todo, found.witness, "x")) == pytest.approx(1, abs=1e-5)
     assert float(check.margin(todo._replace(error=exact(0.25)), found.witness, "x")) == pytest.approx(0.75, abs=1e-5)
     with pytest.raises(Refused, match=r"x\.gram\[\d\]: proves no decrease: at best -0\.5"):
@@ -143,7 +145,8 @@ def test_an_error_is_taken_from_the_margin():
 
 def test_indefinite_matrices_are_refused():
     todo = cubic(0.5)
-    found = program.solve(todo, program.shape_of(todo, 1, 2, 0)).witness
+    shape = program.shape_of(todo, 1, 2, 0)
+    found = program.solve(program.data_of(todo, shape), shape).witness
     gram = [[row[:] for row in matrix] for matrix in found.gram]
     gram[1][0][0] = Q(-1, 1 << 60)
     with pytest.raises(Refused, match=r"x\.gram\[1\]: is not positive definite"):
@@ -152,3 +155,14 @@ def test_indefinite_matrices_are_refused():
         check.margin(todo, found._replace(multipliers=[[]]), "x")
     with pytest.raises(Refused, match="order 2 in time needs more than 2 Bernstein polynomials"):
         check.margin(todo, found._replace(gram=found.gram[:2]), "x")
+
+
+def test_samples_bound_the_margin():
+    """No program's margin exceeds the least sampled value, and here the sphere has but two points."""
+    todo, z = cubic(0.75), np.array([[-1.0, 1.0]])
+    shape = program.shape_of(todo, 1, 2, 0)
+    assert program.lowest(program.data_of(todo, shape), shape, z) == pytest.approx(0.5)
+    todo = ellipse_in_a_case(-0.6)
+    shape, angle = program.shape_of(todo, 2, 3, 1), np.linspace(0, 2 * np.pi, 10000)
+    circle = np.stack([np.cos(angle), np.sin(angle)])
+    assert program.lowest(program.data_of(todo, shape), shape, circle) == pytest.approx(-0.11, abs=1e-3)
