@@ -72,10 +72,12 @@ def rate(plant: check.Plant, parameters: Mapping[str, float], x: np.ndarray, u: 
 class Loop:
     """The claimed loop in float64, and the value function that shapes its funnel.
 
-    Between knots S is the cubic Hermite interpolant of S_k with the Riccati equation's slopes.
+    Between knots S is the cubic Hermite interpolant of S_k with the slopes of the policy's Riccati equation.
     """
 
-    def __init__(self, claim: check.Claim, arrays: Mapping[str, np.ndarray]):
+    def __init__(
+        self, claim: check.Claim, arrays: Mapping[str, np.ndarray], policy: Mapping[str, float] | None = None
+    ):
         def floats(values: Any) -> Any:
             return np.array(_floats(values))
 
@@ -87,13 +89,15 @@ class Loop:
         self.gains, self.goal, self.goal_gain = floats(claim.K), floats(claim.x_goal), floats(claim.K_goal)
         self.bounds = np.array([np.inf if b is None else float(b) for b in claim.bounds])
         self.values = np.asarray(arrays["S"])
-        weights = np.asarray(arrays["Q"]), 1 / float(arrays["R"][0, 0])
-        self._slopes = np.array(
-            [
-                [_riccati(self.values[k + end], *self._linear(self.x[k + end], u), *weights) for end in (0, 1)]
-                for k, u in enumerate(self.u)
-            ]
-        )
+        q, r = np.asarray(arrays["Q"]), float(arrays["R"][0, 0])
+        told = policy or {}
+        left = np.maximum(1 - np.abs(self.u) / self.limit, told.get("authority", 1.0))
+        shift = told.get("discount", 0.0) * np.eye(self.n)
+        self._slopes = np.zeros((len(self.u), 2, self.n, self.n))
+        for k, u in enumerate(self.u):
+            for end in (0, 1):
+                a, b = self._linear(self.x[k + end], u)
+                self._slopes[k, end] = _riccati(self.values[k + end], a + shift, b, q, left[k] ** 2 / r)
 
     def rate(self, x: np.ndarray, u: Any) -> np.ndarray:
         return rate(self.plant, self.parameters, x, u)
