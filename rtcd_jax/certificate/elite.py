@@ -79,7 +79,7 @@ def certify_elite(run: Path, name: str, rung: str, on_step: Callable[[Step], Non
     arrays, record = read_elite(run / "elites", name)
     told, folder = claim_of(arrays, record), run / "certificates"
     claim = _claim(told, len(arrays["u"]), 1.0)
-    loop, exact = Loop(claim, arrays), rung == "proved"
+    loop, exact = Loop(claim, arrays, record.get("policy")), rung == "proved"
     journal = Journal(folder / f".{name}.partial.jsonl", {"claim": check.seal(told), "rung": rung})
     region = _region(claim, loop, exact, journal)
     if region is None:

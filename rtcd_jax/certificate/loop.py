@@ -75,9 +75,7 @@ class Loop:
     Between knots S is the cubic Hermite interpolant of S_k with the slopes of the policy's Riccati equation.
     """
 
-    def __init__(
-        self, claim: check.Claim, arrays: Mapping[str, np.ndarray], policy: Mapping[str, float] | None = None
-    ):
+    def __init__(self, claim: check.Claim, arrays: Mapping[str, np.ndarray], policy: Mapping[str, float] | None = None):
         def floats(values: Any) -> Any:
             return np.array(_floats(values))
 
@@ -89,8 +87,8 @@ class Loop:
         self.gains, self.goal, self.goal_gain = floats(claim.K), floats(claim.x_goal), floats(claim.K_goal)
         self.bounds = np.array([np.inf if b is None else float(b) for b in claim.bounds])
         self.values = np.asarray(arrays["S"])
-        q, r = np.asarray(arrays["Q"]), float(arrays["R"][0, 0])
         told = policy or {}
+        q, r = np.asarray(arrays["Q"]), told.get("input_weight", 1.0) * float(arrays["R"][0, 0])
         left = np.maximum(1 - np.abs(self.u) / self.limit, told.get("authority", 1.0))
         shift = told.get("discount", 0.0) * np.eye(self.n)
         self._slopes = np.zeros((len(self.u), 2, self.n, self.n))
