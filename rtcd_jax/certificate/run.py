@@ -122,7 +122,7 @@ def _table(outcomes: Sequence[Outcome], rung: str) -> str:
         table.add_column(heading, justify="right")
     for outcome in outcomes:
         pairs = {key: f"{value:.4g} / {outcome.found[key]:.4g}" for key, value in outcome.sampled.items()}
-        ratio = outcome.found["sum"] / outcome.sampled["sum"]
+        sampled = outcome.sampled["sum"]
         table.add_row(
             outcome.elite,
             f"{outcome.start:.4g}",
@@ -130,7 +130,7 @@ def _table(outcomes: Sequence[Outcome], rung: str) -> str:
             f"{outcome.seconds:.1f}",
             pairs["inlet"],
             pairs["sum"],
-            f"{ratio:.4f}",
+            f"{outcome.found['sum'] / sampled:.4f}" if sampled else "none",
             pairs["integral"],
             pairs["goal"],
         )

@@ -12,12 +12,12 @@ def floats(values):
 class Simulated:
     """Motions that start on and in the ellipsoid of one interval, followed to t_N and beyond."""
 
-    def __init__(self, content, steps=20):
+    def __init__(self, content, steps=20, rate=rate, limit="torque_limit"):
         claim = content["claim"]
         self.parameters = {key: float.fromhex(v) for key, v in claim["parameters"].items()}
         self.x, self.rates, self.u, self.K = (floats(claim[key]) for key in ("x", "rates", "u", "K"))
         self.goal, self.goal_gain, self.dt = (floats(claim[key]) for key in ("x_goal", "K_goal", "dt"))
-        self.limit, self.steps = self.parameters["torque_limit"], steps
+        self.limit, self.steps, self.rate = self.parameters[limit], steps, rate
         self.funnel, self.goal_axes = content["funnel"], floats(content["goal"]["axes"])
 
     def nominal(self, k, t):
@@ -40,7 +40,7 @@ class Simulated:
     def _tracking(self, k, t, x):
         gain = (1 - t) * self.K[k] + t * self.K[k + 1]
         u = self.u[k] - gain @ (x - self.nominal(k, t)[:, None])
-        return self.dt * rate(x, np.clip(u, -self.limit, self.limit), self.parameters)
+        return self.dt * self.rate(x, np.clip(u, -self.limit, self.limit), self.parameters)
 
     def _level(self, piece, k, t, s, x):
         bend = floats(piece["bend"])
@@ -51,7 +51,7 @@ class Simulated:
     def _goal_levels(self, x, duration=12.0, step=0.01):
         def held(x, _):
             u = -self.goal_gain @ (x - self.goal[:, None])
-            return rate(x, np.clip(u, -self.limit, self.limit), self.parameters)
+            return self.rate(x, np.clip(u, -self.limit, self.limit), self.parameters)
 
         levels = []
         for _ in range(round(duration / step)):
