@@ -52,7 +52,7 @@ def certify(arguments: Sequence[str]) -> int:
     from rtcd_jax.console import Console
 
     with Console() as console:
-        whole = certify_run(options.run, options.elites, options.rung, options.workers, console)
+        whole = certify_run(options.run, options.elites, options.rung, options.workers, console, options.optimize_value)
     return OK if whole else BROKEN_PROMISE
 
 

@@ -56,6 +56,7 @@ class CertifyOptions:
     run: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RUN", help="the run folder")]
     elites: Annotated[int, tyro.conf.arg(help="how many, the best first [-] (>= 1)")] = 1
     rung: Annotated[Literal["certified", "proved"], tyro.conf.arg(help="how much is to be shown")] = "proved"
+    optimize_value: Annotated[bool, tyro.conf.arg(help="free the ellipsoids' shape where that enlarges it")] = False
     workers: Annotated[int, tyro.conf.arg(help="processes, one elite each [-] (>= 1)")] = 2
 
 

@@ -5,8 +5,8 @@ infinite-horizon LQR with the same Q and R; K = R^-1 B' S (paper, section II-C).
 value function that continues through t_N.
 
 The configuration's `policy` may make the controller leave authority: A becomes A + alpha I, and R becomes
-w R / max(1 - |u*| / u_max, authority)^2 with the interval's own u*. The defaults, alpha = 0 and w = authority = 1, change
-nothing.
+w R / max(1 - |u*| / u_max, authority)^2 with the interval's own u*. The defaults, alpha = 0 and w = authority = 1,
+change nothing.
 """
 
 from functools import partial

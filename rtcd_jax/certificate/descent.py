@@ -6,11 +6,12 @@ raised, the interval halved, and the rate raised again.
 """
 
 from collections.abc import Iterator
-from typing import NamedTuple, final
+from typing import NamedTuple, cast, final
 
 import numpy as np
+from scipy.linalg import expm
 
-from rtcd_jax.certificate import check, program
+from rtcd_jax.certificate import check, flow, program
 from rtcd_jax.certificate.check import Claim, Obligation, Q, Refused, Stretch, Witness
 from rtcd_jax.certificate.loop import Loop
 
@@ -33,7 +34,12 @@ COLLAPSE = 1e-3
 """Share of its level that a funnel must keep within an interval."""
 BOX_SHARE = 0.999
 """Share of the level at which an ellipsoid would touch a limit."""
+AIMS_SHARED = 4
+"""Of so many directions, the linear programs of free ellipsoids get one."""
 DIRECTIONS = {2: 720, 4: 4000}
+
+
+Pair = tuple[np.ndarray, np.ndarray]
 
 
 class Proved(NamedTuple):
@@ -73,8 +79,8 @@ def on_grid(matrix: np.ndarray) -> list[list]:
 class Descent:
     """The search for one elite's funnel. `exact` asks the checker after every interval (rung *proved*)."""
 
-    def __init__(self, claim: Claim, loop: Loop, exact: bool):
-        self.claim, self.loop, self.exact = claim, loop, exact
+    def __init__(self, claim: Claim, loop: Loop, exact: bool, evenness: float | None = None):
+        self.claim, self.loop, self.exact, self.evenness = claim, loop, exact, evenness
         self._directions = directions(claim.n)
 
     def outlet(self, rho: float) -> Front:
@@ -118,7 +124,8 @@ class Descent:
 
     def _attempt(self, k: int, start: float, end: float, front: Front, spare: float) -> Proved | None:
         try:
-            piece, rho = self._piece(k, start, end, front, spare)
+            shape = self._piece if self.evenness is None else self._fastest_piece
+            piece, rho = shape(k, start, end, front, spare)
             check.insist_bounds(self.claim, check.motion(self.claim, piece), "limits")
             piece, todo, degree = self._models(piece, spare)
             found = prove(todo, degree, piece.orders[0], self.exact, self._directions)
@@ -137,14 +144,30 @@ class Descent:
         if rho > cap:
             rho = cap
             first_growth = last_growth = float(np.log(front.rho / rho) / duration)
-        a, a_rate = loop.axes(k, start, rho, first_growth)
-        b, b_rate = loop.axes(k, end, front.rho, last_growth)
+        first = loop.axes(k, start, rho, first_growth)
+        return self._stretch(k, start, end, front, first, loop.axes(k, end, front.rho, last_growth)), rho
+
+    def _stretch(self, k: int, start: float, end: float, front: Front, first: Pair, last: Pair) -> Stretch:
+        """The interval between two ellipsoids with their rates, its last one exactly the front's."""
+        (a, a_rate), (b, b_rate), duration = first, last, (end - start) * self.loop.dt
         chord = (b - a) / 2
         at_start, at_end = (a_rate * duration / 2 - chord) / 2, (chord - b_rate * duration / 2) / 2
         bend = [on_grid((at_end + at_start) / 2), on_grid((at_end - at_start) / 2)]
         shares = Q(*start.as_integer_ratio()), Q(*end.as_integer_ratio())
         order = TIERS[self.claim.n][0][0]
-        return Stretch(k, *shares, on_grid(a), front.axes, bend, (TIME_ORDER, order), {}), rho
+        return Stretch(k, *shares, on_grid(a), front.axes, bend, (TIME_ORDER, order), {})
+
+    def _fastest_piece(self, k: int, start: float, end: float, front: Front, spare: float) -> tuple[Stretch, float]:
+        """As `_piece` with ellipsoids of free shape; the level is that of the same volume."""
+        loop, duration = self.loop, (end - start) * self.loop.dt
+        b = np.array([[float(c) for c in row] for row in front.axes])
+        aims = self._directions[:, ::AIMS_SHARED]
+        w = flow.fastest_growth(loop, k, start, end, b, spare, cast(float, self.evenness), aims)
+        if w is None:
+            raise Refused("interval", "no ellipsoid can be carried back")
+        a = b @ expm(-w * duration)
+        volume = np.linalg.det(a) * np.sqrt(np.linalg.det(loop.value(k, start)[0]))
+        return self._stretch(k, start, end, front, (a, a @ w), (b, b @ w)), float(volume ** (2 / loop.n))
 
     def _growth(self, k: int, share: float, rho: float, spare: float) -> float:
         return self.loop.growth(k, share, rho, self._directions) + spare

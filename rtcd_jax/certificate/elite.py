@@ -10,7 +10,8 @@ import numpy as np
 
 from rtcd_jax.certificate import check
 from rtcd_jax.certificate.check import Claim, Node, Witness
-from rtcd_jax.certificate.descent import SPARE, Descent, Front
+from rtcd_jax.certificate.descent import AIMS_SHARED, SPARE, Descent, Front, directions
+from rtcd_jax.certificate.flow import best_evenness
 from rtcd_jax.certificate.goal import GoalRegion, goal_region
 from rtcd_jax.certificate.loop import Loop, claim_of, double, doubles, sealed
 from rtcd_jax.files import replace, writing
@@ -69,8 +70,12 @@ class Journal:
             file.write(f"{json.dumps(line)}\n".encode())
 
 
-def certify_elite(run: Path, name: str, rung: str, on_step: Callable[[Step], None]) -> Outcome | None:
+def certify_elite(
+    run: Path, name: str, rung: str, on_step: Callable[[Step], None], optimize_value: bool = False
+) -> Outcome | None:
     """Writes `certificates/NAME.json` of a run folder; None if not even a goal region can be shown.
+
+    `optimize_value` frees the ellipsoids' shape where that is predicted to enlarge the funnel.
 
     Raises:
         UserError: an elite that is not there, or of a plant that the checker does not know.
@@ -80,12 +85,14 @@ def certify_elite(run: Path, name: str, rung: str, on_step: Callable[[Step], Non
     told, folder = claim_of(arrays, record), run / "certificates"
     claim = _claim(told, len(arrays["u"]), 1.0)
     loop, exact = Loop(claim, arrays, record.get("policy")), rung == "proved"
-    journal = Journal(folder / f".{name}.partial.jsonl", {"claim": check.seal(told), "rung": rung})
+    journal = Journal(
+        folder / f".{name}.partial.jsonl", {"claim": check.seal(told), "rung": rung, "optimize_value": optimize_value}
+    )
     region = _region(claim, loop, exact, journal)
     if region is None:
         return None
     goal, outlet = region
-    descent = Descent(claim, loop, exact)
+    descent = Descent(claim, loop, exact, _evenness(loop, outlet, arrays, journal) if optimize_value else None)
     front = _front(descent, claim, outlet, journal)
     for proved in descent.down_from(front):
         piece = proved.piece
@@ -149,6 +156,18 @@ def _region(claim: Claim, loop: Loop, exact: bool, journal: Journal) -> tuple[di
     goal = _goal_record(region)
     journal.append({"goal": goal, "outlet": region.outlet})
     return goal, region.outlet
+
+
+def _evenness(loop: Loop, outlet: float, arrays: Mapping[str, np.ndarray], journal: Journal) -> float | None:
+    """How the shape is freed, from the journal if it is there; None keeps the elite's S."""
+    for line in journal.lines:
+        if "evenness" in line:
+            return line["evenness"]
+    last, aims = len(loop.u) - 1, directions(loop.n)[:, ::AIMS_SHARED]
+    axes, _ = loop.axes(last, 1.0, outlet, 0.0)
+    evenness = best_evenness(loop, axes, np.asarray(arrays["rho"]), aims)
+    journal.append({"evenness": evenness})
+    return evenness
 
 
 def _front(descent: Descent, claim: Claim, outlet: float, journal: Journal) -> Front:

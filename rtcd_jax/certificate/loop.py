@@ -142,6 +142,20 @@ class Loop:
 
         return _highest(rises, directions)
 
+    def drift(self, k: int, share: float, axes: np.ndarray, y: np.ndarray) -> np.ndarray:
+        """y'L^-1 (f(x* + L y, u) - x*') [D] for directions y [n D] of an ellipsoid L."""
+        center, center_rate = self.nominal(k, share)
+        gain = (1 - share) * self.gains[k] + share * self.gains[k + 1]
+        error = axes @ y
+        u = np.clip(self.u[k] - gain @ error, -self.limit, self.limit)
+        fall = self.rate(center[:, None] + error, u) - center_rate[:, None]
+        return np.sum(y * np.linalg.solve(axes, fall), axis=0)
+
+    def rooms(self, k: int, share: float) -> np.ndarray:
+        """The half widths [n] that the limits on the states leave to an ellipsoid."""
+        center, _ = self.nominal(k, share)
+        return self.bounds - np.abs(center)
+
     def box_level(self, k: int, share: float) -> float:
         """The level of the ellipsoid that touches a limit on the states."""
         center, _ = self.nominal(k, share)

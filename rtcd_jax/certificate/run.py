@@ -49,7 +49,9 @@ class Progress:
         )
 
 
-def certify_run(folder: Path, elites: int, rung: str, workers: int, console: Console) -> bool:
+def certify_run(
+    folder: Path, elites: int, rung: str, workers: int, console: Console, optimize_value: bool = False
+) -> bool:
     """Certificates of a run's best elites; True if every funnel was shown from t = 0 to the goal.
 
     Stores `certificates/NNN.json` and `certificates/summary.json`. What was finished before a kill is not done again.
@@ -65,7 +67,7 @@ def certify_run(folder: Path, elites: int, rung: str, workers: int, console: Con
         target.mkdir(exist_ok=True)
     outcomes: dict[str, Outcome | None] = {}
     began, reached = time.monotonic(), dict.fromkeys(names, 0.0)
-    for event in _events(folder, names, rung, workers):
+    for event in _events(folder, names, rung, workers, optimize_value):
         if isinstance(event, Step):
             reached[event.elite] = 1 - event.knot / event.knots
             done = round(1000 * sum(reached.values()) / len(reached))
@@ -80,13 +82,15 @@ def certify_run(folder: Path, elites: int, rung: str, workers: int, console: Con
     return all(outcome is not None and outcome.whole for outcome in outcomes.values())
 
 
-def _events(folder: Path, names: Sequence[str], rung: str, workers: int) -> Iterator[Step | tuple[str, Outcome | None]]:
+def _events(
+    folder: Path, names: Sequence[str], rung: str, workers: int, optimize_value: bool
+) -> Iterator[Step | tuple[str, Outcome | None]]:
     """Steps of all elites as they come, and every elite's outcome by its name."""
     context = multiprocessing.get_context("spawn")
     steps = context.Queue()
     pool = ProcessPoolExecutor(min(workers, len(names)), context, _remember, (steps,))
     with pool:
-        waiting: dict[Future, str] = {pool.submit(_work, folder, name, rung): name for name in names}
+        waiting: dict[Future, str] = {pool.submit(_work, folder, name, rung, optimize_value): name for name in names}
         try:
             while waiting:
                 with contextlib.suppress(queue.Empty):
@@ -107,8 +111,8 @@ def _remember(steps: Any) -> None:
     os.environ["OMP_NUM_THREADS"] = "1"
 
 
-def _work(folder: Path, name: str, rung: str) -> Outcome | None:
-    return certify_elite(folder, name, rung, _steps.put)
+def _work(folder: Path, name: str, rung: str, optimize_value: bool) -> Outcome | None:
+    return certify_elite(folder, name, rung, _steps.put, optimize_value)
 
 
 def _summary(outcome: Outcome | None) -> dict[str, Any] | None:
