@@ -18,14 +18,14 @@ from rtcd_jax.certificate.loop import Loop
 
 EVENNESS = (0.1, 0.3, 1.0)
 """Weights of the fastest shrinking direction beside the volume, to choose from: none is best for all elites."""
-ROUNDS = 3
+ROUNDS = 6
 TIMES = 5
 """Instants of an interval at which the inequality is asked for."""
 FASTEST = 100.0
 """Largest |entry of W| [1/s]."""
 SETTLING = 0.02
 """Time [s] in which an ellipsoid may use up what is left to a limit on the states."""
-SHARE_OF_LIMIT = 0.999
+SHARE_OF_LIMIT = 0.99
 WIDEST = 2.0
 """Largest half width [rad] along the angle: beyond it polynomials follow the sine badly."""
 PREDICTED_SPARE = 0.02
@@ -42,11 +42,12 @@ def fastest_growth(
     cost = np.array([*(float(i == j) for i, j in pairs), evenness])
     products = _products(y, pairs)
     below = np.column_stack([-products, np.ones(len(products))])  # the last unknown is max y'W y
-    w = np.zeros((loop.n, loop.n))
+    w = path = np.zeros((loop.n, loop.n))
     for _ in range(ROUNDS):
+        path = (path + w) / 2  # without the average the rounds alternate about their limit
         rows, levels = [], []
         for share in np.linspace(start, end, TIMES):
-            here = axes @ expm(-w * (end - share) * loop.dt)
+            here = axes @ expm(-path * (end - share) * loop.dt)
             rows.append(products)
             levels.append(loop.drift(k, share, here, y) + spare)
             narrow, least = _limits(loop, k, share, here, pairs)
@@ -57,6 +58,7 @@ def fastest_growth(
         found = linprog(cost, -table, -np.concatenate([*levels, np.zeros(len(below))]), bounds=(-FASTEST, FASTEST))
         if found.status != 0:
             return None
+        w = np.zeros((loop.n, loop.n))
         for (i, j), value in zip(pairs, found.x[:-1], strict=True):
             w[i, j] = w[j, i] = value
     return w

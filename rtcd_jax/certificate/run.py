@@ -15,6 +15,7 @@ from typing import Any, Protocol, final
 from rich.box import SIMPLE
 from rich.console import Console as Terminal
 from rich.table import Table
+from scipy.stats import spearmanr
 
 from rtcd_jax.certificate.elite import Outcome, Step, certify_elite
 from rtcd_jax.errors import UserError
@@ -23,6 +24,8 @@ from rtcd_jax.storage import elite_names
 
 POLL = 0.2
 """Seconds between looks at the workers' progress."""
+RANKED = 3
+"""Elites from which on a rank correlation says something."""
 
 
 class Console(Protocol):
@@ -75,7 +78,11 @@ def certify_run(
         else:
             outcomes[event[0]] = event[1]
     replace_json(target / "summary.json", {name: _summary(outcomes[name]) for name in names})
-    console.message(_table([outcomes[name] for name in names if outcomes[name] is not None], rung))
+    finished = [outcome for name in names if (outcome := outcomes[name]) is not None]
+    console.message(_table(finished, rung))
+    if len(finished) >= RANKED:
+        correlation = rank_correlation(finished)
+        console.message(f"rank correlation of sampled and {rung} sums over {len(finished)} elites: {correlation:.3f}")
     for name in names:
         if outcomes[name] is None:
             console.message(f"{name}: no goal region can be shown at any level that was tried")
@@ -113,6 +120,12 @@ def _remember(steps: Any) -> None:
 
 def _work(folder: Path, name: str, rung: str, optimize_value: bool) -> Outcome | None:
     return certify_elite(folder, name, rung, _steps.put, optimize_value)
+
+
+def rank_correlation(outcomes: Sequence[Outcome]) -> float:
+    """Spearman's, between the sampled and the shown sums of volumes: 1 if the proof would rank the elites the same."""
+    sums = [[outcome.sampled["sum"], outcome.found["sum"]] for outcome in outcomes]
+    return float(spearmanr(sums).statistic)
 
 
 def _summary(outcome: Outcome | None) -> dict[str, Any] | None:

@@ -4,11 +4,12 @@ import json
 
 import numpy as np
 import pytest
+from scipy.linalg import expm
 
 from rtcd_jax import cli
-from rtcd_jax.certificate import check, descent, elite
+from rtcd_jax.certificate import check, descent, elite, flow
 from rtcd_jax.certificate.loop import Loop, claim_of, double, sealed
-from rtcd_jax.certificate.run import certify_run
+from rtcd_jax.certificate.run import certify_run, rank_correlation
 from rtcd_jax.errors import UserError
 from rtcd_jax.storage import write_elite
 from tests.certificate import swing
@@ -165,3 +166,46 @@ def test_the_command_line(run, tmp_path, capsys):
     errors = capsys.readouterr().err
     assert "has no elites yet" in errors
     assert "--elites = 0: must be >= 1" in errors
+
+
+def test_ranks_of_sampled_and_proved_sums():
+    def outcome(sampled, found):
+        return elite.Outcome("000", "proved", 0.0, 1, 1.0, {"sum": sampled}, {"sum": found})
+
+    alike = [outcome(1.0, 10.0), outcome(2.0, 20.0), outcome(3.0, 25.0)]
+    turned = [outcome(1.0, 30.0), outcome(2.0, 20.0), outcome(3.0, 10.0)]
+    assert rank_correlation(alike) == pytest.approx(1)
+    assert rank_correlation(turned) == pytest.approx(-1)
+
+
+@pytest.mark.slow
+def test_ellipsoids_of_free_shape_are_larger(tmp_path):
+    """Where S is not TVLQR's but a poor one, freeing the shape gives more than the proof with that S."""
+    arrays, _ = swing.elite()
+    slim = np.array([[4.0, 0.0], [0.0, 0.5]])
+    values = arrays["S"].copy()
+    values[:-1] = slim @ values[:-1] @ slim
+    rho = np.full(5, 4.0)
+    sums = []
+    for freed in (False, True):
+        run = folder_of(tmp_path / str(freed), S=values, rho=rho)
+        outcome = elite.certify_elite(run, "000", "proved", lambda step: None, optimize_value=freed)
+        sums.append(outcome.found["sum"])
+        assert check.check_file(run / "certificates" / "000.json").volumes == outcome.found
+    assert sums[1] > 1.2 * sums[0]
+
+
+def test_free_shapes_obey_the_sampled_inequality():
+    """y'W y >= g on the sphere, and the trace is the least: the Riccati equation's own W has a larger one."""
+    arrays, record = swing.elite()
+    claim = claimed(arrays, record)
+    loop, aims = Loop(claim, arrays), descent.directions(2)[:, ::4]
+    axes, _ = loop.axes(2, 1.0, 3.0, 0.0)
+    w = flow.fastest_growth(loop, 2, 0.0, 1.0, axes, 0.1, 0.0, aims)
+    for share in (0.0, 0.5, 1.0):
+        here = axes @ expm(-w * (1 - share) * loop.dt)
+        growth = np.sum(aims * (w @ aims), axis=0) - loop.drift(2, share, here, aims)
+        assert growth.min() > 0.05
+    usual = loop.growth(2, 1.0, 3.0, aims)
+    _, rates = loop.axes(2, 1.0, 3.0, usual)
+    assert np.trace(w) < np.trace(np.linalg.solve(axes, rates)) + 2 * 0.1
