@@ -14,6 +14,13 @@ from rtcd_jax.errors import UserError, closest
 OK, BROKEN_PROMISE, WRONG_INPUT, INTERRUPTED = 0, 1, 2, 130
 RUNS = Path("checkpoints")
 
+CPU_FLAGS = (
+    "--xla_cpu_prefer_vector_width=512",  # twice as fast with AVX-512
+    # Loops over knots are compiled whole: elsewhere every operation in them is a call of its own.
+    "--xla_backend_extra_options=xla_cpu_small_while_loop_byte_threshold=100000000",
+)
+"""XLA's options for the CPU."""
+
 
 def optimize(arguments: Sequence[str]) -> int:
     """search for the design and the weights with the largest funnel, or resume a search"""
@@ -116,8 +123,8 @@ def _version() -> str:
 def _prepare_jax() -> None:
     """Double precision, one CPU device for each core that this process may use, and its full vector width."""
     flags = os.environ.get("XLA_FLAGS", "")
-    if "xla_cpu_prefer_vector_width" not in flags:
-        os.environ["XLA_FLAGS"] = f"{flags} --xla_cpu_prefer_vector_width=512".strip()  # twice as fast with AVX-512
+    ours = (flag for flag in CPU_FLAGS if flag.split("=")[0] not in flags)
+    os.environ["XLA_FLAGS"] = " ".join([flags, *ours]).strip()
     import jax
 
     jax.config.update("jax_enable_x64", True)

@@ -147,7 +147,16 @@ class TrajectoryConfig(Settings):
     substeps: int = Field(
         default=5, ge=1, description="RK4 steps of dynamics and Riccati equation inside an interval [-]"
     )
+    limit_share: float = Field(
+        default=1.0,
+        gt=0,
+        le=1,
+        description="share of the state limits for the nominal motion; the rest is the funnel's [-]",
+    )
     max_iterations: int = Field(default=200, ge=1, description="iterations of the trajectory optimizer [-]")
+    starts: int = Field(
+        default=1, ge=1, le=2, description="starts to solve, the cheapest is kept; others replace those that fail [-]"
+    )
 
 
 class PolicyConfig(Settings):
@@ -180,8 +189,9 @@ class GoalConfig(Settings):
 class FunnelConfig(Settings):
     rollouts: Literal["closed_form", "mjx", "mixed"] = Field(default="mixed", description="dynamics of the rollouts")
     mjx_share: float = Field(default=0.01, ge=0, le=1, description="share of the fresh samples on MJX when mixed [-]")
-    directions: int = Field(default=32, ge=1, description="quasi-random directions at each knot [-]")
-    radii: int = Field(default=10, ge=2, description="log-spaced radii of the first pass along each direction [-]")
+    directions: int = Field(default=12, ge=1, description="quasi-random directions at each knot [-]")
+    climbers: int = Field(default=4, ge=2, description="directions led to the worst one, from knot to knot [-]")
+    climbs: int = Field(default=3, ge=0, description="steps towards it, at each knot [-]")
     steps: int = Field(default=5, ge=1, description="RK4 steps of a rollout inside an interval [-]")
     trials: int = Field(default=32, ge=1, description="fresh uniform states of each ellipsoid, at each knot [-]")
     confidence: float = Field(default=0.99, gt=0, lt=1, description="1 - beta, jointly over the knots [-]")

@@ -36,13 +36,11 @@ class Dynamics:
 class Effort:
     """How thoroughly a funnel is sampled.
 
-    `passes` of directions behind the coarse one, `rounds` of fresh states at most, and whether these are followed to
-    the goal in the end.
+    `rounds` of fresh states at most, and whether these are followed to the goal in the end.
     """
 
     funnel: FunnelConfig
     dynamics: Dynamics
-    passes: int
     rounds: int
     follow: bool
 
@@ -64,15 +62,15 @@ def confirm(problem, candidate, sets: Ellipsoids, tracked, levels, key, effort: 
     def one_pass(levels, key):
         inner, share = jax.random.split(key)
         x = _fresh(starts, levels[:-1], inner, effort.funnel.trials)
-        ends, inside = rollout.roll_intervals(problem, candidate, tracked, x, effort.dynamics.fresh)
+        ends, peaks = rollout.roll_intervals(problem, candidate, tracked, x, effort.dynamics.fresh)
         if effort.dynamics.share is not None:
             which = _share(share, x.shape[1], effort.funnel)
             part = tracked.part(which.knots)
             chosen = x[:, which.knots, : which.states]
-            new_ends, new_inside = rollout.roll_intervals(problem, candidate, part, chosen, effort.dynamics.share)
+            new_ends, new_peaks = rollout.roll_intervals(problem, candidate, part, chosen, effort.dynamics.share)
             ends = ends.at[:, which.knots, : which.states].set(new_ends)
-            inside = inside.at[which.knots, : which.states].set(new_inside)
-        shrunk, failures = _shrink(levels, starts.level(x), nexts.level(ends), inside)
+            peaks = peaks.at[which.knots, : which.states].set(new_peaks)
+        shrunk, failures = _shrink(levels, starts.level(x), nexts.level(ends), peaks <= 1)
         return shrunk, jnp.append(failures, 0)
 
     done = _repeat(one_pass, levels, key, effort.rounds)
@@ -98,13 +96,13 @@ def follow(problem, candidate, policy, sets: Ellipsoids, tracked, levels, key, e
         flat = fresh.reshape(fresh.shape[0], 1, -1)  # every state is in the same interval at the same time
 
         def interval(x, k):
-            ends, inside = rollout.roll_intervals(problem, candidate, tracked.part(k + np.arange(1)), x, dynamics)
+            ends, peaks = rollout.roll_intervals(problem, candidate, tracked.part(k + np.arange(1)), x, dynamics)
             started = born <= k
-            return jnp.where(started, ends, x), (sets.part(k + np.arange(1)).level(x), inside, started)
+            return jnp.where(started, ends, x), (sets.part(k + np.arange(1)).level(x), peaks <= 1, started)
 
         x, path = jax.lax.scan(interval, flat, jnp.arange(knots - 1))
-        ends, inside = rollout.roll_at_goal(problem, candidate, policy.gains[-1], x, dynamics, goal.horizon, goal.step)
-        arrives = inside & (last.level(ends) < last.level(x))
+        ends, peaks = rollout.roll_at_goal(problem, candidate, policy.gains[-1], x, dynamics, goal.horizon, goal.step)
+        arrives = (peaks <= 1) & (last.level(ends) < last.level(x))
         final = _below(levels[-1], last.level(x), ~arrives)
 
         def backward(carry, knot):

@@ -10,7 +10,7 @@ from functools import partial
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.sharding import AxisType, Mesh, PartitionSpec
+from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec
 
 from rtcd_jax import rollout
 from rtcd_jax.confirmation import Dynamics, Effort
@@ -26,12 +26,12 @@ Evaluate = Callable[[jax.Array, jax.Array], Evaluation]
 
 
 def search_effort(problem: Problem) -> Effort:
-    """That of a generation: two passes of fresh states, a share of them through MJX if the rollouts are mixed."""
+    """That of a generation: two rounds of fresh states, a share of them through MJX if the rollouts are mixed."""
     funnel = problem.config.funnel
     share = rollout.mjx(problem.plant) if funnel.rollouts == "mixed" else None
     use = rollout.mjx if funnel.rollouts == "mjx" else rollout.closed_form
     physics = use(problem.plant)
-    return Effort(funnel, Dynamics(physics, physics, share), passes=1, rounds=2, follow=False)
+    return Effort(funnel, Dynamics(physics, physics, share), rounds=2, follow=False)
 
 
 def elite_effort(problem: Problem) -> Effort:
@@ -44,7 +44,7 @@ def elite_effort(problem: Problem) -> Effort:
     use = rollout.closed_form if config.funnel.rollouts == "closed_form" else rollout.mjx
     physics = use(problem.plant)
     funnel = config.funnel.model_copy(update=counts)
-    return Effort(funnel, Dynamics(physics, physics), passes=3, rounds=40, follow=True)
+    return Effort(funnel, Dynamics(physics, physics), rounds=40, follow=True)
 
 
 def make_evaluate(problem: Problem, effort: Effort | None = None) -> Evaluate:
@@ -74,7 +74,9 @@ def spread(evaluate: Evaluate, devices: list[jax.Device]) -> Evaluate:
     def on_all(genomes, key) -> Evaluation:
         count = genomes.shape[0]
         padding = jnp.repeat(genomes[-1:], -count % len(devices), 0)
-        evaluation = shared(jnp.concatenate([genomes, padding]), key)
+        # Wherever they come from, placed alike: one program for all callers.
+        padded = jax.device_put(jnp.concatenate([genomes, padding]), NamedSharding(mesh, split))
+        evaluation = shared(padded, jax.device_put(key, NamedSharding(mesh, whole)))
         return jax.tree.map(lambda leaf: leaf[:count], evaluation)
 
     return on_all

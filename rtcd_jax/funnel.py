@@ -2,11 +2,14 @@
 
     rho_k = sup {rho : every sampled x with V_k(x) <= rho stays inside the boxes and ends with V_{k+1} <= rho_{k+1}}
 
-(paper, section II-D.2, by simulation). Where a state ends after one interval does not depend on any level: all knots
-and samples are rolled out at once, and one cheap backward scan then sets every level. A coarse pass over the whole box
-and finer ones about its result are followed by fresh independent states (confirmation.py). rho_N comes from long
-rollouts under the goal's LQR.
+(paper, section II-D.2, by simulation), knot by knot backward from rho_N, which comes from long rollouts under the
+goal's LQR. At every knot states are rolled out along rays through the set, on a ladder of radii about the next level's.
+Few random directions come near the worst one, and what each knot misses multiplies along the motion: the worst one is
+climbed to, from where it was at the knot behind. Fresh independent states confirm the whole (confirmation.py).
 """
+
+from functools import partial
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -16,16 +19,16 @@ from rtcd_jax import rollout
 from rtcd_jax.confirmation import Effort, confirm, follow
 from rtcd_jax.numerics import sampling
 from rtcd_jax.numerics.ellipsoid import Ellipsoids
+from rtcd_jax.numerics.sphere import climb
 from rtcd_jax.problem import Problem
 from rtcd_jax.types import Candidate, Funnel, Policy, Status, first_failure
 
-COARSE_DIRECTIONS = 12
-COARSE_DECADES = 3.0
-"""The first pass looks at radii from the box's down to a thousandth of it: a millionth of its level."""
+SMALLEST = 1e-3
+"""Radius over the box's below which a set counts as empty: a millionth of its level."""
 
-WINDOWS = (1.35, 1.1, 1.02)
-WINDOW_RADII = 4
-"""`Effort.passes` later passes look at so many radii, from the last pass' radius over its window to it times that."""
+COARSE = np.geomspace(0.5, 2.0, 5)
+FINE = np.array([0.97, 1.03])
+"""Radii over that of the next level, then over the one found so: a first look and a second one."""
 
 BRACKET_OVERLAP = 1.05
 """Radii at the goal: a round starts below the last one's by this, since its other directions may find less."""
@@ -39,39 +42,19 @@ def estimate_funnel(problem: Problem, candidate: Candidate, policy: Policy, key,
 
     `trials[k]` fresh states, independent and uniform in the final B_k, were rolled out without a failure: over their
     interval or, with `effort.follow`, to the goal. It is zero where the last pass still had to shrink the level.
-    Status: FUNNEL_EMPTY if some level is below the smallest sampled one.
+    Status: FUNNEL_EMPTY if some level is below the smallest one that counts.
     """
-    keys = jax.random.split(key, 5)
+    keys = jax.random.split(key, 4)
     sets = Ellipsoids.about(policy.trajectory.xs.T, jnp.moveaxis(policy.values, 0, -1))
-    dtype = sets.centers.dtype
-    boxes = sets.radii_inside(jnp.asarray(problem.state_limits, dtype))
+    boxes = sets.radii_inside(jnp.asarray(problem.state_limits, sets.centers.dtype))
     tracked = rollout.reference(problem, candidate, policy, effort.funnel.steps)
     last = _goal_level(problem, candidate, policy, sets.part(slice(-1, None)), boxes[-1], keys[0], effort)
 
-    def pass_over(radii, directions, dynamics):
-        """Levels from the rays through `directions` [n D] with ascending `radii` [N J]."""
-        grid = jnp.broadcast_to(radii[:, None, :], (radii.shape[0], directions.shape[1], radii.shape[1]))
-        x = sets.part(slice(0, -1)).points(grid, directions[:, None, :, None])
-        ends, inside = rollout.roll_intervals(problem, candidate, tracked, x, dynamics)
-        return _scan_rays(grid, sets.part(slice(1, None)).level(ends), inside, last)
-
-    def closer(levels, pass_):
-        window, key = pass_
-        near = jnp.sqrt(levels)[:, None] * window ** np.linspace(-1, 1, WINDOW_RADII)
-        aims = sampling.directions(key, effort.funnel.directions, n, dtype)
-        return pass_over(jnp.minimum(near, boxes[:-1, None]), aims, effort.dynamics.directions), None
-
-    n = problem.plant.n
-    coarse = boxes[:-1, None] * np.logspace(-COARSE_DECADES, 0, effort.funnel.radii)
-    aims = sampling.directions(keys[1], COARSE_DIRECTIONS, n, dtype)
-    levels = pass_over(coarse, aims, rollout.closed_form(problem.plant))
-    windows = jnp.asarray(WINDOWS[: effort.passes], dtype)
-    levels, _ = jax.lax.scan(closer, levels, (windows, jax.random.split(keys[2], effort.passes)))
-
-    levels, trials = confirm(problem, candidate, sets, tracked, jnp.append(levels, last), keys[3], effort)
+    levels = _scan_knots(problem, candidate, sets, tracked, boxes, last, keys[1], effort)
+    levels, trials = confirm(problem, candidate, sets, tracked, levels, keys[2], effort)
     if effort.follow:
-        levels, trials = follow(problem, candidate, policy, sets, tracked, levels, keys[4], effort)
-    full = jnp.all(levels >= (boxes * 10**-COARSE_DECADES) ** 2) & jnp.all(boxes > 0)
+        levels, trials = follow(problem, candidate, policy, sets, tracked, levels, keys[3], effort)
+    full = jnp.all(levels >= (boxes * SMALLEST) ** 2) & jnp.all(boxes > 0)
     finite = jnp.all(jnp.isfinite(levels)) & jnp.all(jnp.isfinite(policy.values))
     status = first_failure(
         policy.status,
@@ -79,6 +62,72 @@ def estimate_funnel(problem: Problem, candidate: Candidate, policy: Policy, key,
         jnp.where(full, Status.OK, Status.FUNNEL_EMPTY),
     )
     return Funnel(policy, levels, trials, status)
+
+
+def _scan_knots(problem, candidate, sets: Ellipsoids, tracked, boxes, last, key, effort: Effort):
+    """Levels [N+1] backward from the `last` one."""
+    n, dtype, funnel = problem.plant.n, sets.centers.dtype, effort.funnel
+
+    def backward(carry, knot):
+        target, shrinkage, climbers = carry
+        index, box, key = knot
+        step = _Step.at(problem, candidate, sets, tracked, index)
+
+        def badness(radii, directions):
+            """The radii [D J] up to the box's, and at most 1 where a state stays in the boxes and in the next set."""
+            radii = jnp.broadcast_to(jnp.minimum(radii, box), (directions.shape[1], radii.shape[0]))
+            reached, peaks = step.ends(radii, directions[..., None], effort.dynamics.directions)
+            bad = jnp.maximum(jnp.sum(reached**2, 0) / target, peaks**2)
+            return radii, jnp.where(jnp.isnan(bad), jnp.inf, bad)
+
+        expected = jnp.minimum(jnp.sqrt(target) * shrinkage, box)
+        climbers = climb(partial(step.ends_alone, expected), climbers, funnel.climbs)
+        fresh = sampling.directions(key, funnel.directions, n, dtype)
+        directions = jnp.concatenate([fresh, climbers], 1)
+        rough = jnp.min(_crossings(*badness(jnp.sqrt(target) * COARSE, directions)))
+        radii, bad = badness(rough * FINE, directions)
+        level = (1 - MARGIN) * jnp.min(_crossings(radii, bad)) ** 2
+        # The worst of the random ones takes the place of the tamest climber: there may be several maxima.
+        newcomer = _worst(fresh, bad[: funnel.directions, -1], 1)
+        survivors = _worst(climbers, bad[funnel.directions :, -1], funnel.climbers - 1)
+        return (level, jnp.sqrt(level / target), jnp.concatenate([newcomer, survivors], 1)), level
+
+    keys = jax.random.split(key, boxes.shape[0])
+    start = last, jnp.ones((), dtype), sampling.directions(keys[-1], funnel.climbers, n, dtype)
+    knots = jnp.arange(boxes.shape[0] - 1), boxes[:-1], keys[:-1]
+    _, levels = jax.lax.scan(backward, start, knots, reverse=True)
+    return jnp.append(levels, last)
+
+
+def _worst(directions, bad, count: int):
+    """Those `count` of the directions [n D] that are worst."""
+    return directions[:, jnp.argsort(-bad)[:count]]
+
+
+class _Step(NamedTuple):
+    """One interval: the sets at both its ends, and what carries a state from one to the other."""
+
+    problem: Problem
+    candidate: Candidate
+    here: Ellipsoids
+    there: Ellipsoids
+    tracked: rollout.Reference
+
+    @classmethod
+    def at(cls, problem, candidate, sets: Ellipsoids, tracked, index) -> "_Step":
+        one = index + np.arange(1)
+        return cls(problem, candidate, sets.part(one), sets.part(one + 1), tracked.part(one))
+
+    def ends(self, radii, y, dynamics):
+        """Ends [n ...] of the states `radii` times `y` [n ...], as points of the next set's ball, and peaks [...]."""
+        shape = jnp.broadcast_shapes(jnp.shape(radii), y.shape[1:])
+        x = self.here.points(jnp.broadcast_to(radii, shape)[None], y[:, None])
+        ends, peaks = rollout.roll_intervals(self.problem, self.candidate, self.tracked, x, dynamics)
+        return self.there.to_ball(ends)[:, 0], peaks[0]
+
+    def ends_alone(self, radii, y):
+        """The ends under the plant's own equations."""
+        return self.ends(radii, y, rollout.closed_form(self.problem.plant))[0]
 
 
 def _goal_level(problem, candidate, policy, goal_set: Ellipsoids, box, key, effort: Effort):
@@ -97,38 +146,24 @@ def _goal_level(problem, candidate, policy, goal_set: Ellipsoids, box, key, effo
         grid = jnp.broadcast_to(ladder, (goal.directions, goal.radii))
         x = goal_set.points(grid[None], directions[:, None, :, None])
         dynamics = effort.dynamics.directions
-        ends, inside = rollout.roll_at_goal(problem, candidate, gain, x, dynamics, goal.horizon, goal.step)
-        crossing = jnp.min(_crossings(grid, goal_set.level(ends)[0] / grid**2, inside[0], 1.0))
+        ends, peaks = rollout.roll_at_goal(problem, candidate, gain, x, dynamics, goal.horizon, goal.step)
+        crossing = jnp.min(_crossings(grid, jnp.maximum(goal_set.level(ends) / grid**2, peaks**2)[0]))
         index = jnp.clip(jnp.searchsorted(ladder, crossing, side="right") - 1, 0, goal.radii - 2)
         return (ladder[index] / BRACKET_OVERLAP, ladder[index + 1], crossing), None
 
     # Far out the rollouts diverge so steeply that no crossing can be interpolated before the bracket is narrow.
-    start = (box * 10**-COARSE_DECADES, box, box)
+    start = (box * SMALLEST, box, box)
     (_, _, radius), _ = jax.lax.scan(narrow, start, jax.random.split(key, goal.rounds))
     return (1 - MARGIN) * radius**2
 
 
-def _scan_rays(radii, ends, inside, last):
-    """Levels [N] from the last level and V at the next knots, `ends` [N D J], of the rays' ascending radii [N D J]."""
+def _crossings(radii, bad):
+    """Radius [D] below which `bad` <= 1 at all ascending radii [D J] of a ray.
 
-    def backward(target, knot):
-        radii, ends, inside = knot
-        # Where no radius of a ray is good: V ~ r^2 from the lowest one, if the boxes at least held there.
-        lowest = jnp.where(inside[:, 0], radii[:, 0] * jnp.sqrt(jnp.minimum(target / ends[:, 0], 1.0)), 0.0)
-        crossings = _crossings(radii, ends, inside, target)
-        level = (1 - MARGIN) * jnp.min(jnp.where(crossings > 0, crossings, lowest)) ** 2
-        return level, level
-
-    _, levels = jax.lax.scan(backward, last, (radii, ends, inside), reverse=True)
-    return levels
-
-
-def _crossings(radii, ends, inside, target):
-    """Radius [D] below which `ends` <= target and `inside` hold at all radii [D J] of a ray; 0 if at none.
-
-    Interpolated between the last good radius and the first bad one on logarithmic scales, where V ~ r^2 is exact.
+    Interpolated between the last good radius and the first bad one on logarithmic scales, where V ~ r^2 is exact; where
+    no radius is good, continued from the lowest one in the same way.
     """
-    good = jnp.cumprod(inside & (ends <= target), 1).astype(bool)
+    good = jnp.cumprod(bad <= 1, 1).astype(bool)
     count = jnp.sum(good, 1)
     below = jnp.maximum(count - 1, 0)
     above = jnp.minimum(count, radii.shape[1] - 1)
@@ -136,8 +171,8 @@ def _crossings(radii, ends, inside, target):
     def take(a, index):
         return jnp.take_along_axis(a, index[:, None], 1)[:, 0]
 
-    r0, v0, r1, v1 = take(radii, below), take(ends, below), take(radii, above), take(ends, above)
-    share = jnp.clip(jnp.log(target / v0) / jnp.log(v1 / v0), 0.0, 1.0)
-    known = take(inside, above) & jnp.isfinite(v1) & (above > below)
-    between = jnp.where(known, r0 * (r1 / r0) ** share, r0)
-    return jnp.where(count == 0, 0.0, between)
+    r0, v0, r1, v1 = take(radii, below), take(bad, below), take(radii, above), take(bad, above)
+    share = jnp.clip(-jnp.log(v0) / jnp.log(v1 / v0), 0.0, 1.0)
+    between = jnp.where(jnp.isfinite(v1) & (r1 > r0), r0 * (r1 / r0) ** share, r0)
+    lowest = jnp.where(jnp.isfinite(v0), r0 / jnp.sqrt(v0), 0.0)
+    return jnp.where(count == 0, lowest, between)

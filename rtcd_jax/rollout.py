@@ -77,7 +77,7 @@ def reference(problem: Problem, candidate: Candidate, policy: Policy, steps: int
 
 
 def roll_intervals(problem: Problem, candidate: Candidate, tracked: Reference, x, dynamics: Dynamics):
-    """End states [n N ...] after one interval each, and whether the boxes on x held at every step [N ...].
+    """End states [n N ...] after one interval each, and the largest |x_i| / limit_i at any step [N ...].
 
     `x` [n N ...] are states at the intervals' starts.
     """
@@ -86,7 +86,7 @@ def roll_intervals(problem: Problem, candidate: Candidate, tracked: Reference, x
     feedforward = align(tracked.inputs)
 
     def step(carry, stage):
-        x, inside = carry
+        x, peak = carry
         states, gains = stage
 
         def slope(x, place):
@@ -95,15 +95,15 @@ def roll_intervals(problem: Problem, candidate: Candidate, tracked: Reference, x
             return split(dynamics.rate(candidate.design, jnp.stack(x), u))
 
         x = _step(slope, x, tracked.step, dynamics.large)
-        return (x, inside & _within(x, limits)), None
+        return (x, jnp.maximum(peak, _fill(x, limits))), None
 
     x = split(x)
-    (x, inside), _ = jax.lax.scan(step, (x, _within(x, limits)), (tracked.states, tracked.gains))
-    return jnp.stack(x), inside
+    (x, peak), _ = jax.lax.scan(step, (x, _fill(x, limits)), (tracked.states, tracked.gains))
+    return jnp.stack(x), peak
 
 
 def roll_at_goal(problem: Problem, candidate: Candidate, gain, x, dynamics: Dynamics, duration: float, step: float):
-    """End states [n ...] after `duration` [s] under the goal's LQR, and whether the boxes held on the way [...]."""
+    """End states [n ...] after `duration` [s] under the goal's LQR, and the largest |x_i| / limit_i till then [...]."""
     limits, bounds = problem.state_limits, _column(problem.input_limits, x)
     gain = _align(gain, x.ndim - 1)
 
@@ -112,13 +112,13 @@ def roll_at_goal(problem: Problem, candidate: Candidate, gain, x, dynamics: Dyna
         return split(dynamics.rate(candidate.design, jnp.stack(x), jnp.clip(-_feedback(gain, error), -bounds, bounds)))
 
     def advance(_, carry):
-        x, inside = carry
+        x, peak = carry
         x = _step(slope, x, step, dynamics.large)
-        return x, inside & _within(x, limits)
+        return x, jnp.maximum(peak, _fill(x, limits))
 
     x = split(x)
-    x, inside = jax.lax.fori_loop(0, round(duration / step), advance, (x, _within(x, limits)))
-    return jnp.stack(x), inside
+    x, peak = jax.lax.fori_loop(0, round(duration / step), advance, (x, _fill(x, limits)))
+    return jnp.stack(x), peak
 
 
 def _feedback(gain, error):
@@ -126,12 +126,13 @@ def _feedback(gain, error):
     return sum(gain[:, i] * e for i, e in enumerate(error))
 
 
-def _within(x, limits: np.ndarray):
-    inside = jnp.ones(x[0].shape, bool)
+def _fill(x, limits: np.ndarray):
+    """Largest |x_i| / limit_i; not a number where a limited component is none."""
+    fill = jnp.zeros_like(x[0])
     for component, limit in zip(x, limits, strict=True):
         if np.isfinite(limit):
-            inside = inside & (jnp.abs(component) <= limit)
-    return inside
+            fill = jnp.maximum(fill, jnp.abs(component) / limit)
+    return fill
 
 
 def _step(slope, x, dt, looped: bool):

@@ -2,11 +2,13 @@
 
 import time
 from collections.abc import Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from rtcd_jax import search
 from rtcd_jax.config import Config
@@ -33,9 +35,10 @@ def optimize(config: Config, folder: Path, console: Console) -> None:
     problem = make_problem(config)
     evaluate = spread(make_evaluate(problem), jax.devices())
     plan = search.Plan(config.search, config.elites, tuple(initial_genome(problem).tolist()), problem.design_dims)
-    with RunFolder.open(folder, config) as run:
+    with RunFolder.open(folder, config) as run, ThreadPoolExecutor(1) as pool:
         genomes = jnp.zeros((config.search.population, len(problem.free)))
-        begun = run.restore(search.start(plan, jax.eval_shape(evaluate, genomes, jax.random.key(0))))
+        example = jax.eval_shape(evaluate, genomes, jax.random.key(0))
+        begun = run.restore(search.start(plan, example))
         done = int(begun.generation)
         if done == config.search.generations and (folder / LAST_FILE).is_file():
             console.message(f"{folder} is complete: {done} generations, {len(elite_names(folder))} elites")
@@ -43,13 +46,14 @@ def optimize(config: Config, folder: Path, console: Console) -> None:
         if done:
             console.message(f"{folder}: going on after generation {done}")
         console.message(f"compiling the evaluation of {config.search.population} candidates on {_devices()}")
+        again = pool.submit(_compile_resample, problem, example)  # beside the evaluation's own compilation
         state, clock = begun, _Clock(config.search.population)
         for state, generation in search.run(plan, evaluate, begun):
             run.append(vars(generation))
             run.save_if_due(state, int(state.generation))
             console.progress(_progress(config, generation, clock))
         run.save(state, int(state.generation))
-        _finish(problem, plan, evaluate, state, run, console)
+        _finish(problem, plan, evaluate, again, state, run, console)
 
 
 class _Clock:
@@ -88,28 +92,40 @@ def _progress(config: Config, generation: search.Generation, clock: _Clock) -> P
     )
 
 
+def _compile_resample(problem: Problem, population: Evaluation) -> jax.stages.Compiled:
+    """`resample` with the elites' effort for one candidate of a `population` (arrays' shapes)."""
+    one = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape[1:], leaf.dtype), population)
+    return jax.jit(partial(resample, problem, elite_effort(problem))).lower(one, jax.random.key(0)).compile()
+
+
 def _finish(
-    problem: Problem, plan: search.Plan, evaluate: Evaluate, state: search.SearchState, run: RunFolder, console: Console
+    problem: Problem,
+    plan: search.Plan,
+    evaluate: Evaluate,
+    again: Future[jax.stages.Compiled],
+    state: search.SearchState,
+    run: RunFolder,
+    console: Console,
 ) -> None:
     """Sample the funnels of the elites and the initial candidate again, more thoroughly, and store everything."""
     effort = elite_effort(problem)
-    again = jax.jit(partial(resample, problem, effort))
-    elites = state.elites
+    elites = jax.device_get(state.elites)
     filled = int(elites.count)
     first = jnp.tile(jnp.asarray(initial_genome(problem)), (plan.settings.population, 1))
 
     def sampled(index: int, evaluation: Evaluation, key) -> Evaluation:
-        found = jax.block_until_ready(again(evaluation, key))
+        found = jax.device_get(again.result()(evaluation, key))
         console.message(f"funnel sampled again: {index + 1} of {filled + 1}")
         return found
 
     def reevaluate(genomes, key) -> Evaluation:
         found = [sampled(k, _row(elites.evaluation, k), key) for k in range(filled)]
         found += [found[-1]] * (len(genomes) - filled)
-        return jax.tree.map(lambda *leaves: jnp.stack(leaves), *found)
+        return jax.tree.map(lambda *leaves: np.stack(leaves), *found)
 
     finished = search.finish(plan, reevaluate, state)
-    initial = sampled(filled, _row(evaluate(first, jax.random.key(0)), 0), jax.random.key(plan.settings.seed))
+    evaluated = jax.device_get(evaluate(first, jax.random.key(0)))
+    initial = sampled(filled, _row(evaluated, 0), jax.random.key(plan.settings.seed))
     if not int(finished.count):
         raise UserError(
             f"none of the {filled} elites kept a funnel under more samples: raise funnel.directions or funnel.trials, "

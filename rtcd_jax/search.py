@@ -131,7 +131,7 @@ def step(plan: Plan, evaluate: Evaluate, state: SearchState) -> tuple[SearchStat
     strategy, stops = _tell(plan, strategy, points, seen.costs, anew)
     after = SearchState(
         strategy=strategy,
-        elites=_unbound(_merge(plan, state.elites, evaluation, state.generation)),
+        elites=_unbound(_merge(plan, state.elites, evaluation, state.generation, plan.elites.distance)),
         generation=state.generation + 1,
         evaluations=state.evaluations + len(seen.costs),
         restarts=state.restarts + jnp.sum(stops != Stop.NONE, dtype=jnp.int32),
@@ -166,7 +166,7 @@ def finish(plan: Plan, reevaluate: Evaluate, state: SearchState) -> Elites:
     status = jnp.where(jnp.isfinite(first.costs), evaluation.status, jnp.int32(Status.NOT_FINITE))
     evaluation = eqx.tree_at(lambda e: e.status, evaluation, status)
     none = elites.empty(plan.elites.count, evaluation)
-    return elites.merge(none, evaluation, plan.settings.objective, first.generations, distance=0.0)
+    return _merge(plan, none, evaluation, first.generations, 0.0)
 
 
 def _loop(plan: Plan) -> Joint | Nested:
@@ -199,8 +199,10 @@ def _tell(plan: Plan, strategy: cmaes.State | NestedState, points, costs: Float[
 
 
 @functools.partial(jax.jit, static_argnums=0)
-def _merge(plan: Plan, archive: Elites, evaluation: Evaluation, generation: Int[Array, ""]) -> Elites:
-    return elites.merge(archive, evaluation, plan.settings.objective, generation, plan.elites.distance)
+def _merge(
+    plan: Plan, archive: Elites, evaluation: Evaluation, generation: Int[Array, "*E"], distance: float
+) -> Elites:
+    return elites.merge(archive, evaluation, plan.settings.objective, generation, distance)
 
 
 def _unbound(tree):

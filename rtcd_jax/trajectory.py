@@ -8,7 +8,6 @@ midpoint step instead). This verb plans for a whole population at once rather th
 solver refills its lanes as candidates finish, so that slow ones do not hold up their neighbours.
 """
 
-from collections.abc import Callable
 from functools import partial
 
 import jax
@@ -25,32 +24,50 @@ from rtcd_jax.types import Candidate, Status, Trajectory
 SWING = 0.4
 """Amplitude of the starting guesses' swings over the distance from start to goal."""
 
+SHARES = (0.5, 0.25)
+"""Steps of the starting guesses, as shares of their box; the one that more often ends better comes first."""
+
+PATIENCE = 2
+"""Iterations that a further start may take, over those that solved the candidate before."""
+
 RESOLVED_RATE = 1e-3
 """Oscillations below this [rad/s] are roundings of eigenvalues that are real."""
 
 
 def plan(problem: Problem, candidates: Candidate) -> Trajectory:
-    """The cheapest trajectory found from a small family of starts, for every candidate [P].
+    """The cheapest trajectory found from `starts` of a small family of starts, for every candidate [P].
 
-    A candidate's result does not depend on the others. Its status is TRAJECTORY_NOT_SOLVED if no start ended within
-    1e-9 of the interval map and inside the boxes.
+    Where a start fails, the next one takes its place. A candidate's result does not depend on the others. Its status is
+    TRAJECTORY_NOT_SOLVED if no start ended within 1e-9 of the interval map and inside the boxes.
     """
     settings = problem.config.trajectory
     parameters = jax.tree.map(lambda leaf: jnp.moveaxis(leaf, 0, -1), candidates)
     control = interior_point.ControlProblem(
-        stage=partial(_stage, problem, partial(interval_map, problem, substeps=settings.substeps)),
-        model=partial(_stage, problem, partial(_rough_interval_map, problem)),
+        interval=lambda x, u, h, candidate: interval_map(problem, candidate, x, u, h, settings.substeps),
+        rate=lambda x, u, candidate: problem.plant.dynamics(candidate.design, x, u),
+        running=partial(_running, problem),
         start=problem.start,
         goal=problem.goal,
-        state_limits=problem.state_limits,
+        state_limits=settings.limit_share * problem.state_limits,
         input_limits=problem.input_limits,
         step_limits=(settings.step.min, settings.step.max),
     )
-    guesses = starts(problem, parameters.q.dtype)
-    solution = interior_point.solve(
-        control, parameters, guesses, interior_point.Settings(max_iterations=settings.max_iterations)
-    )
-    return _cheapest(solution, guesses.h.shape[-1])
+    most = settings.max_iterations
+
+    def attempt(known, guess):
+        best, solved = known
+        # A start that takes much longer than the one before it seldom ends better.
+        allowance = jnp.where(best.solved, jnp.minimum(PATIENCE * best.iterations, most), most)
+        allowance = jnp.where(solved < settings.starts, allowance, 0)
+        found = interior_point.solve(control, parameters, guess, allowance)
+        return (_better(best, found, allowance > 0), solved + found.solved), None
+
+    family = starts(problem, parameters.q.dtype)
+    none = _nothing(family, candidates.q.shape[0])
+    (best, _), _ = jax.lax.scan(attempt, (none, none.iterations), family)
+    us, xs, h = (jnp.moveaxis(leaf, -1, 0) for leaf in (best.us, best.xs, best.h))
+    status = jnp.where(best.solved, Status.OK, Status.TRAJECTORY_NOT_SOLVED).astype(jnp.int32)
+    return Trajectory(us, xs, h, best.cost, best.defect, best.iterations, status)
 
 
 def interval_map(problem: Problem, candidate: Candidate, x, u, h, substeps: int):
@@ -59,42 +76,29 @@ def interval_map(problem: Problem, candidate: Candidate, x, u, h, substeps: int)
     return jnp.stack(rk4(dynamics, split(x), u, h, substeps))
 
 
-def _rough_interval_map(problem: Problem, candidate: Candidate, x, u, h):
-    """Phi by one RK4 step, within about 1e-3: enough for the derivatives of a Newton method.
-
-    On whole arrays: derivatives of components make a program of twice the time.
-    """
-    return rk4(partial(problem.plant.dynamics, candidate.design), x, u, h, 1)
-
-
-def _stage(problem: Problem, interval: Callable, x, u, h, candidate: Candidate):
-    """One interval's end and cost for x [n N P], u [m N P], h [P]."""
-    error = x - jnp.asarray(problem.goal, x.dtype)[:, None, None]
-    q, r = candidate.q[:, None], candidate.r[:, None]
-    running = 0.5 * (jnp.sum(q * error**2, 0) + jnp.sum(r * u**2, 0))
-    cost = h * (running + problem.config.trajectory.time_weight)
-    return interval(candidate, x, u, h), cost
+def _running(problem: Problem, x, u, candidate: Candidate):
+    """Cost per time of the components x (n arrays) and u (m arrays)."""
+    states = sum(q * (x - goal) ** 2 for q, x, goal in zip(candidate.q, x, problem.goal, strict=True))
+    inputs = sum(r * u**2 for r, u in zip(candidate.r, u, strict=True))
+    return 0.5 * (states + inputs) + problem.config.trajectory.time_weight
 
 
-def _cheapest(solution: interior_point.Solution, family: int) -> Trajectory:
-    solved, cost, defect = (leaf.reshape(-1, family) for leaf in (solution.solved, solution.cost, solution.defect))
-    cheapest = jnp.argmin(jnp.where(solved, cost, jnp.inf), 1)
-    closest = jnp.argmin(jnp.where(jnp.isnan(defect), jnp.inf, defect), 1)  # what an unsolved candidate shows
-    best = jnp.where(jnp.any(solved, 1), cheapest, closest) + family * jnp.arange(solved.shape[0])
-    chosen = jax.tree.map(lambda leaf: jnp.moveaxis(leaf[..., best], -1, 0), solution)
-    return Trajectory(
-        us=chosen.us,
-        xs=chosen.xs,
-        dt=chosen.h,
-        cost=chosen.cost,
-        defect=chosen.defect,
-        iterations=chosen.iterations,
-        status=jnp.where(chosen.solved, Status.OK, Status.TRAJECTORY_NOT_SOLVED).astype(jnp.int32),
-    )
+def _nothing(family: interior_point.Guess, count: int) -> interior_point.Solution:
+    """What is known before the first start."""
+    xs, us, h = (jnp.broadcast_to(leaf[0, ..., None], (*leaf.shape[1:], count)) for leaf in family)
+    zero = jnp.zeros(count, jnp.int32)
+    return interior_point.Solution(us, xs, h, cost=0 * h, defect=jnp.inf + h, iterations=zero, solved=zero > 0)
+
+
+def _better(best: interior_point.Solution, found: interior_point.Solution, tried) -> interior_point.Solution:
+    """The cheaper one of two that are solved; of two that are not, the one closer to the dynamics."""
+    cheaper = found.solved & ~(best.solved & (best.cost <= found.cost))
+    closer = ~found.solved & ~best.solved & ~(found.defect >= best.defect)
+    return jax.tree.map(lambda new, old: jnp.where(tried & (cheaper | closer), new, old), found, best)
 
 
 def starts(problem: Problem, dtype) -> interior_point.Guess:
-    """The family of starting guesses: swing to and fro about the start, then into the goal, in a short and a long time.
+    """The family [G ...] of guesses: swing to and fro about the start, then into the goal, in a long and a short time.
 
     Which one ends best depends on how many swings the candidate needs. They are motions, no solutions of the dynamics:
     rolling the dynamics out under a sinusoidal input and bending the end into the goal needs four times the iterations,
@@ -103,10 +107,10 @@ def starts(problem: Problem, dtype) -> interior_point.Guess:
     step = problem.config.trajectory.step
     pace = slowest_oscillation(problem) / (2 * np.pi)
     family = []
-    for share in (0.25, 0.5):
+    for share in SHARES:
         h = step.min + share * (step.max - step.min)
         family.append(_swing(problem, max(2, int(problem.intervals * h * pace)), h))
-    return interior_point.Guess(*(jnp.asarray(np.stack(leaves, -1), dtype) for leaves in zip(*family, strict=True)))
+    return interior_point.Guess(*(jnp.asarray(np.stack(leaves), dtype) for leaves in zip(*family, strict=True)))
 
 
 def slowest_oscillation(problem: Problem) -> float:

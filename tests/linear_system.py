@@ -72,7 +72,7 @@ def problem_of(state_limits, limit=UNBOUNDED, intervals=10, **funnel) -> Problem
     """The linear robot in these boxes, its goal the origin."""
     data = yaml.safe_load(configuration.EXAMPLE)
     data["trajectory"] = {"knots": intervals + 1}
-    sampling = {"rollouts": "closed_form", "directions": 48, "radii": 12, "steps": 8, "trials": 64}
+    sampling = {"rollouts": "closed_form", "directions": 48, "steps": 8, "trials": 64}
     data["funnel"] = sampling | funnel
     plant = Unstable(limit)
     limits = np.array(state_limits, float)

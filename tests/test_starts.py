@@ -40,8 +40,8 @@ def test_guesses_join_the_ends_at_admissible_steps(name):
     positions = problem.plant.n // 2
     step = problem.config.trajectory.step
     for guess in range(guesses.h.size):
-        ends = guesses.xs[[0, -1], :positions, guess]
+        ends = guesses.xs[guess][[0, -1], :positions]
         np.testing.assert_allclose(ends, [problem.start[:positions], problem.goal[:positions]], atol=1e-12)
         assert step.min < guesses.h[guess] < step.max
-        travelled = np.trapezoid(guesses.xs[:, positions:, guess], dx=guesses.h[guess], axis=0)
+        travelled = np.trapezoid(guesses.xs[guess, :, positions:], dx=guesses.h[guess], axis=0)
         np.testing.assert_allclose(travelled, (problem.goal - problem.start)[:positions], atol=1e-2)

@@ -79,7 +79,9 @@ def measure_pipeline(config: Path, population: int, repeats: int) -> Measured:
 
     Genomes are uniform in the unit box of the search. `with_funnel` is the share of candidates whose status is OK.
     """
-    os.environ.setdefault("XLA_FLAGS", "--xla_cpu_prefer_vector_width=512")  # as the command line sets it
+    from rtcd_jax.cli import CPU_FLAGS
+
+    os.environ.setdefault("XLA_FLAGS", " ".join(CPU_FLAGS))  # as the command line sets it
     import jax
 
     jax.config.update("jax_enable_x64", True)

@@ -10,7 +10,12 @@ def basis(z):
     return jnp.broadcast_to(eye.reshape(*eye.shape, *(1,) * (z.ndim - 1)), (z.shape[0], *z.shape))
 
 
+def value_and_jacobian(f, z):
+    """f(z) [o ...] and df/dz [o w ...] of f: [w ...] -> [o ...], by one forward pass that all w columns share."""
+    value, push = jax.linearize(f, z)
+    return value, jnp.swapaxes(jax.vmap(push)(basis(z)), 0, 1)
+
+
 def jacobian(f, z):
-    """df/dz [o w ...] of f: [w ...] -> [o ...], by one forward pass that all w columns share."""
-    _, push = jax.linearize(f, z)
-    return jnp.swapaxes(jax.vmap(push)(basis(z)), 0, 1)
+    """df/dz [o w ...] of f: [w ...] -> [o ...]."""
+    return value_and_jacobian(f, z)[1]

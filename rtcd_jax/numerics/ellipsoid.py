@@ -6,7 +6,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from rtcd_jax.numerics.batched import cholesky, mv, solve_lower, solve_lower_transposed
+from rtcd_jax.numerics.batched import cholesky, mtv, mv, solve_lower, solve_lower_transposed
 
 
 def from_ball(factor, y):
@@ -48,6 +48,10 @@ class Ellipsoids(NamedTuple):
         """x [n K ...] with V(x) = (radii |y|)^2, for radii [K ...] and y that broadcasts to [n K ...]."""
         y = jnp.broadcast_to(y, (y.shape[0], *radii.shape))
         return _behind(self.centers, radii.ndim - 1) + from_ball(_behind(self.factors, radii.ndim - 1), radii * y)
+
+    def to_ball(self, x):
+        """y [n K ...] with |y|^2 = V(x), for x [n K ...]: L' (x - center)."""
+        return mtv(_behind(self.factors, x.ndim - 2), x - _behind(self.centers, x.ndim - 2))
 
     def level(self, x):
         """V(x) [K ...] of x [n K ...]."""

@@ -1,6 +1,6 @@
 """Batched primal-dual interior-point SQP for trajectory optimisation with pinned ends and one free step length.
 
-    minimise over x_1 .. x_{N-1}, u_0 .. u_{N-1}, h     sum_k cost(x_k, u_k, h)
+    minimise over x_1 .. x_{N-1}, u_0 .. u_{N-1}, h     sum_k h running(x_k, u_k)
     subject to   x_{k+1} = next(x_k, u_k, h),  x_0 and x_N given,  boxes on x, u and h
 
 The method is IPOPT's (Waechter and Biegler, Math. Programming 106, 2006; equation numbers below are theirs) with the
@@ -11,20 +11,29 @@ every array, see batched.py, and problems go through in lanes, see lanes.py.
 from collections.abc import Callable
 from typing import NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from rtcd_jax.numerics import kkt
+from rtcd_jax.numerics.entries import dot, plus
+from rtcd_jax.numerics.expansion import Expansion, expander
 from rtcd_jax.numerics.lanes import solve_in_lanes
+
+CACHE = 2**20
+"""Second-level cache of a core [bytes]."""
+
+
+VECTOR = 8
+"""Lanes come in whole vectors: of the rest of a vector, a compiler may round sines and logarithms differently."""
 
 
 class Settings(NamedTuple):
     """Tolerances and the constants of the method."""
 
-    max_iterations: int = 200
-    lanes: int = 32
+    lanes: int = 32  # at most; whole vectors
     defect_tolerance: float = 1e-9
     dual_tolerance: float = 1e-4  # relative to 1 + max |multiplier|
     complementarity_tolerance: float = 1e-5  # likewise
@@ -32,28 +41,31 @@ class Settings(NamedTuple):
     barrier_floor: float = 1e-8
     barrier_factor: float = 0.2  # kappa_mu, (7)
     barrier_power: float = 1.5  # theta_mu, (7)
-    barrier_accuracy: float = 100.0  # kappa_epsilon of algorithm A-2; their 10 is stricter than a warm filter needs
+    barrier_accuracy: float = 1000.0  # kappa_epsilon of algorithm A-2; their 10 is stricter than a warm filter needs
     boundary_fraction: float = 0.99  # tau_min, (8)
     regularization_start: float = 1.0
     regularization_factor: float = 4.0
     trials: int = 3  # few: a lane that backtracks keeps the others waiting, more regularization helps as well
     backtracking: float = 0.4
-    filter_size: int = 48
+    filter_size: int = 16
 
 
 DEFAULTS = Settings()
 
 
 class ControlProblem(NamedTuple):
-    """What to solve. `stage(x, u, h, parameters) -> (next x, cost)` works elementwise on trailing axes.
+    """What to solve. The functions work elementwise on trailing axes.
 
-    `model` is what the derivatives are taken of: the stage itself, or a cheaper integration of the same dynamics. It
-    decides how fast the iteration contracts (an inexact Newton method) and, to second order, how optimal its end is;
-    defects are always measured by `stage`, so that the end is a solution of the accurate dynamics.
+    `interval(x [n ..], u [m ..], h, parameters)` is the next x, `running(x, u, parameters)` the cost per time of an
+    interval, `rate(x, u, parameters)` the time derivative of x, both of tuples x and u of components. Derivatives are
+    taken of one Runge-Kutta step of `rate`, a cheaper integration of the same dynamics. Its error decides how fast the
+    iteration contracts (an inexact Newton method) and, to second order, how optimal its end is; defects are always
+    measured by `interval`, so that the end is a solution of the accurate dynamics.
     """
 
-    stage: Callable
-    model: Callable
+    interval: Callable
+    rate: Callable
+    running: Callable
     start: np.ndarray
     goal: np.ndarray
     state_limits: np.ndarray
@@ -64,9 +76,9 @@ class ControlProblem(NamedTuple):
 class Guess(NamedTuple):
     """Where a solve starts; the ends of `xs` are overwritten by the pinned states."""
 
-    xs: Float[Array, "N+1 n P"]
-    us: Float[Array, "N m P"]
-    h: Float[Array, " P"]
+    xs: Float[Array, "N+1 n *P"]
+    us: Float[Array, "N m *P"]
+    h: Float[Array, "*P"]
 
 
 class Solution(NamedTuple):
@@ -138,33 +150,40 @@ class _Solver:
         self.upper = _Boxed(as_column(x_limit), as_column(problem.input_limits), as_column([high]))
         travel = np.maximum(1.0, np.abs(problem.start - problem.goal))
         scale_x = np.where(np.isfinite(problem.state_limits), problem.state_limits, travel)
-        self.scaling = as_column(np.concatenate([1 / scale_x**2, [0.0], 1 / problem.input_limits**2]))
+        self.scaling = [float(s) for s in (*1 / scale_x**2, 0.0, *1 / problem.input_limits**2)]
         self.step_scaling = 4 / (high - low) ** 2
 
     # ---- the model
 
     def simulate(self, xs, us, h, parameters):
         """Defects [N n P] and the objective [P]."""
-        nexts, costs = self.problem.stage(jnp.moveaxis(xs[:-1], 0, 1), jnp.moveaxis(us, 0, 1), h, parameters)
-        return jnp.moveaxis(nexts, 1, 0) - xs[1:], jnp.sum(costs, 0)
+        x, u = jnp.moveaxis(xs[:-1], 0, 1), jnp.moveaxis(us, 0, 1)
+        nexts = self.problem.interval(x, u, h, parameters)
+        return jnp.moveaxis(nexts, 1, 0) - xs[1:], h * jnp.sum(self.problem.running(tuple(x), tuple(u), parameters), 0)
 
-    def expand(self, xs, us, h, multipliers, parameters):
-        """Jacobians [N n w P], cost gradients [N w P] and Hessians of the Lagrangian [N w w P] of the model.
+    def expand(self, xs, us, h, multipliers, parameters) -> Expansion:
+        """The model's slopes and curvature; entries [N P] or numbers."""
+        expand = expander(self.problem.rate, self.problem.running, self.n, self.m, parameters)
+        stages = (xs[:-1], us, multipliers)
 
-        The Lagrangian is a sum over intervals and problems, so one gradient of the sum is all their gradients.
-        """
-        n, w = self.n, self.n + 1 + self.m
-        x, u, lam = (jnp.moveaxis(a, 0, 1) for a in (xs[:-1], us, multipliers))
-        z = jnp.concatenate([x, jnp.broadcast_to(h, (1, *x.shape[1:])), u])
+        def one(stage):
+            return expand(*(tuple(part) for part in stage[:2]), h, tuple(stage[2]), parameters)
 
-        def lagrangian(z):
-            nexts, costs = self.problem.model(z[:n], z[n + 1 :], z[n], parameters)
-            return jnp.sum(costs) + jnp.sum(lam * nexts), (nexts, costs)
+        def packed(stage):
+            return jnp.stack(jax.tree.leaves(eqx.filter(one(stage), eqx.is_array)))
 
-        _, push = jax.linearize(jax.grad(lagrangian, has_aux=True), z)
-        basis = jnp.broadcast_to(jnp.eye(w, dtype=z.dtype)[:, :, None, None], (w, *z.shape))
-        hessian, (jacobian, gradient) = jax.vmap(push)(basis)
-        return jnp.transpose(jacobian, (2, 1, 0, 3)), jnp.moveaxis(gradient, 0, 1), jnp.transpose(hessian, (2, 0, 1, 3))
+        layout = eqx.filter_eval_shape(one, jax.tree.map(lambda leaf: leaf[0], stages))
+        numbers = jax.tree.map(lambda leaf: leaf if isinstance(leaf, float) else None, layout)
+        # One knot after another stays in a core's cache; other devices want all knots at once.
+        arrays = iter(
+            jax.lax.platform_dependent(
+                stages,
+                cpu=lambda stages: jnp.moveaxis(jax.lax.map(packed, stages), 1, 0),
+                default=lambda stages: packed(jax.tree.map(lambda leaf: jnp.moveaxis(leaf, 1, 0), stages)),
+            )
+        )
+        fill = lambda number: next(arrays) if number is None else number  # noqa: E731
+        return jax.tree.map(fill, numbers, is_leaf=lambda leaf: leaf is None)
 
     def values(self, xs, us, h) -> _Boxed:
         return _Boxed(xs[1:-1, self.boxed], us, h[None])
@@ -203,15 +222,15 @@ class _Solver:
             solved=jnp.zeros((batch,), bool),
         )
 
-    def finished(self, it: _Iterate):
-        return it.solved | (it.iterations >= self.settings.max_iterations)
+    def finished(self, it: _Iterate, allowance):
+        return it.solved | (it.iterations >= allowance)
 
-    def advance(self, it: _Iterate, parameters) -> _Iterate:
+    def advance(self, it: _Iterate, parameters, allowance) -> _Iterate:
         """One interior-point iteration; lanes that are finished come back unchanged."""
         s = self.settings
-        jacobian, gradient, hessian = self.expand(it.xs, it.us, it.h, it.multipliers, parameters)
+        expansion = self.expand(it.xs, it.us, it.h, it.multipliers, parameters)
         slacks = self.slacks(self.values(it.xs, it.us, it.h))
-        dual_error = self.stationarity(it, jacobian, gradient)
+        dual_error = self.stationarity(it, expansion)
         defect = _largest(it.defects)
         size = 1 + _largest(it.multipliers)
         gap = _complementarity(it.duals, slacks, 0.0)
@@ -226,16 +245,19 @@ class _Solver:
             iterations=it.iterations + 1,
             solved=solved,
         )
-        subproblem = self.subproblem(state, slacks, jacobian, gradient, hessian)
+        subproblem = self.subproblem(state, slacks, expansion)
         moved = self.move(state, slacks, subproblem, parameters)
         # A lane that is solved keeps the point that was measured, one that had finished before keeps everything.
         moved = _where(solved, state, moved)
-        return _where(self.finished(it), it, moved)
+        return _where(self.finished(it, allowance), it, moved)
 
-    def stationarity(self, it: _Iterate, jacobian, gradient):
+    def stationarity(self, it: _Iterate, expansion: Expansion):
         """Largest entry of the Lagrangian's gradient, over max(100, mean multiplier)/100: E_0 of (5)."""
         n = self.n
-        slope = gradient + jnp.sum(jacobian * it.multipliers[:, :, None], 1)
+        multipliers = [it.multipliers[:, i] for i in range(n)]
+        columns = zip(*expansion.jacobian, strict=True)
+        slope = [plus(g, dot(column, multipliers)) for g, column in zip(expansion.gradient, columns, strict=True)]
+        slope = self.stacked(slope, it)
         by_state = slope[1:, :n] - it.multipliers[:-1]
         by_state = by_state.at[:, self.boxed].add(it.duals.xs[1] - it.duals.xs[0])
         by_input = slope[:, n + 1 :] + it.duals.us[1] - it.duals.us[0]
@@ -254,24 +276,34 @@ class _Solver:
             barrier = jnp.where(accurate, lower, barrier)
         return barrier
 
-    def subproblem(self, it: _Iterate, slacks: _Boxed, jacobian, gradient, hessian) -> kkt.Subproblem:
+    def subproblem(self, it: _Iterate, slacks: _Boxed, expansion: Expansion) -> kkt.Subproblem:
         """The quadratic model with the barrier's primal-dual terms and the regularization added: (13)."""
         n = self.n
         stiffness = jax.tree.map(lambda dual, slack: jnp.sum(dual / slack, 0), it.duals, slacks)
         force = jax.tree.map(lambda slack: it.barrier * (1 / slack[1] - 1 / slack[0]), slacks)
-        inputs = np.arange(n + 1, n + 1 + self.m)
-        diagonal = jnp.broadcast_to(it.regularization * self.scaling, gradient.shape)
-        diagonal = diagonal.at[:, inputs].add(stiffness.us)
-        diagonal = diagonal.at[1:, self.boxed].add(stiffness.xs)
-        every = np.arange(hessian.shape[1])
+        hessian, gradient = [[*row] for row in expansion.hessian], [*expansion.gradient]
+        for i, scaling in enumerate(self.scaling):
+            hessian[i][i] += it.regularization * scaling
+        for bounded, i in enumerate(self.boxed):
+            hessian[i][i] += jnp.pad(stiffness.xs[:, bounded], ((1, 0), (0, 0)))
+            gradient[i] += jnp.pad(force.xs[:, bounded], ((1, 0), (0, 0)))
+        for i in range(self.m):
+            hessian[n + 1 + i][n + 1 + i] += stiffness.us[:, i]
+            gradient[n + 1 + i] += force.us[:, i]
+        every = (it.us.shape[0], it.h.shape[-1])
+        hessian = [[*row[:i], jnp.broadcast_to(row[i], every)] for i, row in enumerate(hessian)]
         return kkt.Subproblem(
-            hessians=hessian.at[:, every, every].add(diagonal),
-            gradients=gradient.at[:, inputs].add(force.us).at[1:, self.boxed].add(force.xs),
-            jacobians=jacobian,
+            hessian=hessian,
+            gradient=gradient,
+            jacobian=expansion.jacobian,
             defects=it.defects,
             curvature=stiffness.h[0] + it.regularization * self.step_scaling,
             slope=force.h[0],
         )
+
+    def stacked(self, row, it: _Iterate):
+        """Entries as an array [N w P]."""
+        return jnp.stack([jnp.broadcast_to(entry, (it.us.shape[0], it.h.shape[-1])) for entry in row], 1)
 
     def move(self, it: _Iterate, slacks: _Boxed, subproblem: kkt.Subproblem, parameters) -> _Iterate:
         """Newton step, fraction to the boundary, filter line search, new regularization."""
@@ -288,10 +320,11 @@ class _Solver:
         fraction = jnp.maximum(s.boundary_fraction, 1 - it.barrier)
         longest = _boundary_step(slacks, approach, fraction)
         longest_dual = _boundary_step(it.duals, dual_step, fraction)
+        gradient = self.stacked(subproblem.gradient, it)
         descent = (
-            _total(subproblem.gradients[:, :n] * step.dxs[:-1])
-            + _total(subproblem.gradients[:, n + 1 :] * step.dus)
-            + (jnp.sum(subproblem.gradients[:, n], 0) + subproblem.slope) * step.dh
+            _total(gradient[:, :n] * step.dxs[:-1])
+            + _total(gradient[:, n + 1 :] * step.dus)
+            + (jnp.sum(gradient[:, n], 0) + subproblem.slope) * step.dh
         )
         search = self.line_search(it, slacks, step, longest, descent, usable, parameters)
         length = search.length
@@ -430,30 +463,44 @@ def _regularize(it: _Iterate, s: Settings, search: _Search):
     return jnp.minimum(jnp.where(search.forced, now, jnp.where(search.taken, changed, up)), 1e8)
 
 
-def solve(problem: ControlProblem, parameters, guesses: Guess, settings: Settings = DEFAULTS) -> Solution:
-    """Solve every problem of the batch from every guess; the batch is the last axis.
+def _lanes_in_cache(intervals: int, w: int) -> int:
+    """Lanes whose Hessians fill a core's cache; more wait for memory, fewer for calls."""
+    return max(1, CACHE // (8 * intervals * w * w) // VECTOR) * VECTOR
 
-    `parameters` is a pytree with P on the last axis of every leaf, `guesses` holds G guesses; the solutions come
-    back with P * G on the last axis, guess by guess for each problem in turn.
+
+def solve(
+    problem: ControlProblem, parameters, guess: Guess, allowance: Int[Array, " P"], settings: Settings = DEFAULTS
+) -> Solution:
+    """Solve every problem of the batch from one guess, within `allowance` iterations.
+
+    `parameters` is a pytree with P on the last axis of every leaf; so do the solutions come back. The guess has no
+    batch. A problem whose allowance is zero costs nothing; all that is said of it is that it is not solved.
     """
-    count = jax.tree.leaves(parameters)[0].shape[-1]
-    family = guesses.h.shape[-1]
-    solver = _Solver(problem, settings, guesses.xs.dtype)
+    count = allowance.shape[0]
+    solver = _Solver(problem, settings, guess.xs.dtype)
+    order = jnp.argsort(allowance == 0)  # stable: those that are wanted come first
+    place = jnp.argsort(order)
 
     def load(indices):
-        chosen = jax.tree.map(lambda leaf: leaf[..., indices // family], parameters)
-        guess = jax.tree.map(lambda leaf: leaf[..., indices % family], guesses)
-        return solver.initial(guess, chosen), chosen
+        rows = order[indices]
+        chosen = jax.tree.map(lambda leaf: leaf[..., rows], parameters)
+        start = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf[..., None], (*leaf.shape, *rows.shape)), guess)
+        return solver.initial(start, chosen), chosen, allowance[rows]
 
     def advance(state):
-        iterate, chosen = state
-        return solver.advance(iterate, chosen), chosen
+        iterate, chosen, allowed = state
+        return solver.advance(iterate, chosen, allowed), chosen, allowed
 
     def extract(state):
         it = state[0]
         return Solution(it.us, it.xs, it.h, it.cost, _largest(it.defects), it.iterations, it.solved)
 
     def finished(state):
-        return solver.finished(state[0])
+        return solver.finished(state[0], state[2])
 
-    return solve_in_lanes(load, advance, finished, extract, count * family, settings.lanes)
+    wanted = jnp.sum(allowance > 0)
+    width = min(
+        settings.lanes, _lanes_in_cache(guess.us.shape[0], solver.n + 1 + solver.m), -(-count // VECTOR) * VECTOR
+    )
+    solution = solve_in_lanes(load, advance, finished, extract, count, width, wanted)
+    return jax.tree.map(lambda leaf: leaf[..., place], solution)

@@ -8,25 +8,27 @@ end enters through its multiplier nu, which the sweep carries as a parameter: th
 
     V_k(y, nu) = 1/2 y' P y + p' y + nu' (E y + e) - 1/2 nu' W nu,          y = (dx, dh)
 
-so that hard end states need no penalty: two small solves at knot 0 give dh and nu. All arrays have the
-batch on the last axis.
+so that hard end states need no penalty: two small solves at knot 0 give dh and nu. All matrices are lists of entries
+[N P], see entries.py: numbers known beforehand, such as a zero slope, are never computed with.
 """
 
 from typing import NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from rtcd_jax.numerics.batched import mm, mtm, mtv, mv, spd_solve
+from rtcd_jax.numerics.batched import spd_solve
+from rtcd_jax.numerics.entries import Matrix, Row, dot, plus, times
 
 
 class Subproblem(NamedTuple):
-    """The quadratic model above."""
+    """The quadratic model above; entries [N P] or numbers, of the symmetric Hessians at least the lower half."""
 
-    hessians: Float[Array, "N w w P"]
-    gradients: Float[Array, "N w P"]
-    jacobians: Float[Array, "N n w P"]
+    hessian: Matrix  # w w
+    gradient: Row  # w
+    jacobian: Matrix  # n w
     defects: Float[Array, "N n P"]
     curvature: Float[Array, " P"]
     slope: Float[Array, " P"]
@@ -43,76 +45,127 @@ class Step(NamedTuple):
 
 
 class _Value(NamedTuple):
-    quadratic: Float[Array, "y y P"]
-    linear: Float[Array, "y P"]
-    end: Float[Array, "n y P"]
-    end_offset: Float[Array, "n P"]
-    end_curvature: Float[Array, "n n P"]
+    """Entries [P]; of symmetric matrices the lower half."""
+
+    quadratic: Matrix  # P
+    linear: Row  # p
+    end: Matrix  # E
+    end_offset: Row  # e
+    end_curvature: Matrix  # W
     convex: Bool[Array, " P"]
 
 
 def solve(problem: Subproblem, floor: float = 1e-12) -> Step:
     """Solve the KKT system in O(N); pivots at or below `floor` clear the flag `convex`."""
     n, batch = problem.defects.shape[1:]
-    y = n + 1
     dtype = problem.defects.dtype
-    keep_step = jnp.zeros((1, problem.gradients.shape[1], batch), dtype).at[0, n].set(1.0)
-
-    def eliminate_input(value: _Value, stage):
-        hessian, gradient, jacobian, defect = stage
-        flow = jnp.concatenate([jacobian, keep_step])
-        curvature = hessian + mtm(flow, mm(value.quadratic, flow))
-        slope = gradient + mtv(flow, mv(value.quadratic[:, :n], defect) + value.linear)
-        end = mm(value.end, flow)
-        right = jnp.concatenate([curvature[y:, :y], slope[y:, None], jnp.swapaxes(end[:, y:], 0, 1)], 1)
-        solution, convex = spd_solve(curvature[y:, y:], right, floor)
-        gain, offset, gain_end = -solution[:, :y], -solution[:, y], -solution[:, y + 1 :]
-        quadratic = curvature[:y, :y] + mtm(curvature[y:, :y], gain)
-        before = _Value(
-            quadratic=0.5 * (quadratic + jnp.swapaxes(quadratic, 0, 1)),
-            linear=slope[:y] + mtv(curvature[y:, :y], offset),
-            end=end[:, :y] + mm(end[:, y:], gain),
-            end_offset=value.end_offset + mv(value.end[:, :n], defect) + mv(end[:, y:], offset),
-            end_curvature=value.end_curvature - mm(end[:, y:], gain_end),
-            convex=value.convex & convex,
-        )
-        return before, (gain, offset, gain_end, value.quadratic[:n], value.linear[:n], value.end[:, :n])
-
+    zero, one = jnp.zeros((batch,), dtype), jnp.ones((batch,), dtype)
+    identity = [[one if i == j else zero for j in range(n + 1)] for i in range(n)]
     last = _Value(
-        quadratic=jnp.zeros((y, y, batch), dtype),
-        linear=jnp.zeros((y, batch), dtype),
-        end=jnp.broadcast_to(jnp.eye(n, y, dtype=dtype)[:, :, None], (n, y, batch)),
-        end_offset=jnp.zeros((n, batch), dtype),
-        end_curvature=jnp.zeros((n, n, batch), dtype),
+        quadratic=[[zero] * (i + 1) for i in range(n + 1)],
+        linear=[zero] * (n + 1),
+        end=identity,
+        end_offset=[zero] * n,
+        end_curvature=[[zero] * (i + 1) for i in range(n)],
         convex=jnp.ones((batch,), bool),
     )
-    stages = (problem.hessians, problem.gradients, problem.jacobians, problem.defects)
-    first, (gains, offsets, gains_end, rows, slopes, ends) = jax.lax.scan(eliminate_input, last, stages, reverse=True)
+    defects = [problem.defects[:, i] for i in range(n)]
+    arrays, numbers = eqx.partition((problem.hessian, problem.gradient, problem.jacobian, defects), eqx.is_array)
+
+    def eliminate_input(value: _Value, stage):
+        before, policy = _eliminate_input(value, *eqx.combine(stage, numbers), floor)
+        return before, (policy, [*value.linear[:n]], _square(value.quadratic)[:n], [row[:n] for row in value.end])
+
+    first, (policy, slopes, rows, ends) = jax.lax.scan(eliminate_input, last, arrays, reverse=True)
     dh, nu, convex = _solve_first_knot(first, problem, floor)
 
     def roll(dx, stage):
-        gain, offset, gain_end, jacobian, defect = stage
-        du = mv(gain[:, :n], dx) + gain[:, n] * dh + offset + mv(gain_end, nu)
-        after = mv(jacobian[:, :n], dx) + jacobian[:, n] * dh + mv(jacobian[:, y:], du) + defect
+        (gain, offset, gain_end), slopes, defect = stage
+        jacobian = eqx.combine(slopes, numbers[2])
+        y = [*dx, dh]
+        du = [-plus(dot(row, y), o, dot(end, nu)) for row, o, end in zip(gain, offset, gain_end, strict=True)]
+        after = [plus(dot(row, [*y, *du]), c) for row, c in zip(jacobian, defect, strict=True)]
         return after, (after, du)
 
-    start = jnp.zeros((n, batch), dtype)
-    _, (dxs, dus) = jax.lax.scan(roll, start, (gains, offsets, gains_end, problem.jacobians, problem.defects))
-    multipliers = (
-        jnp.sum(rows[:, :, :n] * dxs[:, None], 2) + rows[:, :, n] * dh + slopes + jnp.sum(ends * nu[None, :, None], 1)
-    )
+    start = [zero] * n
+    _, (dxs, dus) = jax.lax.scan(roll, start, (policy, arrays[2], defects))
     # The sweep meets the pinned end up to rounding, which would add up over the iterations.
-    pinned = jnp.concatenate([start[None], dxs[:-1], start[None]])
-    return Step(pinned, dus, dh, multipliers, convex)
+    multipliers = [
+        plus(dot(row, [*dxs, dh]), p, dot(column, nu))
+        for row, p, column in zip(rows, slopes, zip(*ends, strict=True), strict=True)
+    ]
+    pinned = jnp.pad(jnp.stack(dxs, 1)[:-1], ((1, 1), (0, 0), (0, 0)))
+    return Step(pinned, jnp.stack(dus, 1), dh, jnp.stack(multipliers, 1), convex)
+
+
+def _eliminate_input(value: _Value, hessian, gradient, jacobian, defect, floor):
+    """The value one knot earlier, and K, k, G of the input's step du = -(K (dx, dh) + k + G nu)."""
+    n, w = len(jacobian), len(gradient)
+    y = n + 1
+    flow = list(zip(*jacobian, [float(i == n) for i in range(w)], strict=True))  # columns
+    square = _square(value.quadratic)
+    through = [[dot(row, column) for row in square] for column in flow]
+    curvature = [[plus(hessian[i][j], dot(flow[i], through[j])) for j in range(i + 1)] for i in range(w)]
+    ahead = [plus(dot(row[:n], defect), p) for row, p in zip(square, value.linear, strict=True)]
+    slope = [plus(g, dot(column, ahead)) for g, column in zip(gradient, flow, strict=True)]
+    end = [[dot(row, column) for column in flow] for row in value.end]
+    offset = [plus(e, dot(row[:n], defect)) for e, row in zip(value.end_offset, value.end, strict=True)]
+    by_input = [[*curvature[a][:y], slope[a], *(row[a] for row in end)] for a in range(y, w)]
+    solved, convex = _solve_definite([curvature[a][y:] for a in range(y, w)], by_input, floor)
+    columns = list(zip(*by_input, strict=True))
+    solution = list(zip(*solved, strict=True))
+    less = lambda entry, i, j: plus(entry, times(-1.0, dot(columns[i], solution[j])))  # noqa: E731
+    before = _Value(
+        quadratic=[[less(curvature[i][j], i, j) for j in range(i + 1)] for i in range(y)],
+        linear=[less(slope[i], i, y) for i in range(y)],
+        end=[[less(end[i][j], y + 1 + i, j) for j in range(y)] for i in range(n)],
+        end_offset=[less(offset[i], y + 1 + i, y) for i in range(n)],
+        end_curvature=[
+            [plus(value.end_curvature[i][j], dot(columns[y + 1 + i], solution[y + 1 + j])) for j in range(i + 1)]
+            for i in range(n)
+        ],
+        convex=value.convex & convex,
+    )
+    return before, ([row[:y] for row in solved], [row[y] for row in solved], [row[y + 1 :] for row in solved])
+
+
+def _solve_definite(lower: Matrix, right: Matrix, floor):
+    """A^-1 B by L D L', and whether every pivot is above `floor`."""
+    m = len(lower)
+    factor, pivots, rows, positive = [], [], [], True
+    for i in range(m):
+        scaled = []
+        for j in range(i):
+            scaled.append(plus(lower[i][j], *(times(-1.0, times(scaled[k], factor[j][k])) for k in range(j))))
+        factor.append([s / pivot for s, pivot in zip(scaled, pivots, strict=True)])
+        pivot = plus(lower[i][i], times(-1.0, dot(scaled, factor[i])))
+        positive = positive & (pivot > floor)
+        pivots.append(jnp.where(pivot > floor, pivot, 1.0))
+        rows.append(
+            [plus(b, *(times(-1.0, times(factor[i][k], rows[k][c])) for k in range(i))) for c, b in enumerate(right[i])]
+        )
+    solution = [None] * m
+    for i in reversed(range(m)):
+        inverse = 1 / pivots[i]
+        solution[i] = [
+            plus(times(inverse, b), *(times(-1.0, times(factor[k][i], solution[k][c])) for k in range(i + 1, m)))
+            for c, b in enumerate(rows[i])
+        ]
+    return solution, positive
+
+
+def _square(lower: Matrix) -> Matrix:
+    return [[lower[max(i, j)][min(i, j)] for j in range(len(lower))] for i in range(len(lower))]
 
 
 def _solve_first_knot(first: _Value, problem: Subproblem, floor: float):
     """dh and nu from stationarity in both: the 2 x 2 block system eliminated through W."""
-    n = first.end.shape[0]
-    by_step = first.end[:, n]
-    solution, independent = spd_solve(first.end_curvature, jnp.stack([by_step, first.end_offset], 1), floor)
-    pivot = first.quadratic[n, n] + problem.curvature + jnp.sum(by_step * solution[:, 0], 0)
+    n = len(first.end)
+    curvature = jnp.stack([jnp.stack(row) for row in _square(first.end_curvature)])
+    by_step = jnp.stack([row[n] for row in first.end])
+    solution, independent = spd_solve(curvature, jnp.stack([by_step, jnp.stack(first.end_offset)], 1), floor)
+    pivot = first.quadratic[n][n] + problem.curvature + jnp.sum(by_step * solution[:, 0], 0)
     convex = first.convex & independent & (pivot > floor)
     residual = -first.linear[n] - problem.slope - jnp.sum(by_step * solution[:, 1], 0)
     dh = residual / jnp.where(pivot > floor, pivot, 1.0)
-    return dh, solution[:, 0] * dh + solution[:, 1], convex
+    return dh, list(solution[:, 0] * dh + solution[:, 1]), convex

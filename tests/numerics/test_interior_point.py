@@ -25,17 +25,22 @@ PARAMETERS = {
 }
 
 
-def stage(x, u, h, parameters, substeps=4):
-    def rate(x, u):
-        return jnp.stack([x[1], parameters["gain"] * u[0] - parameters["sway"] * jnp.sin(x[0])])
+def rate(x, u, parameters):
+    return jnp.stack([x[1], parameters["gain"] * u[0] - parameters["sway"] * jnp.sin(x[0])])
 
-    cost = h * (parameters["time"] + 0.5 * parameters["effort"] * u[0] ** 2)
-    return rk4(rate, x, u, h, substeps), cost
+
+def running(x, u, parameters):
+    return parameters["time"] + 0.5 * parameters["effort"] * u[0] ** 2
+
+
+def stage(x, u, h, parameters, substeps=4):
+    return rk4(lambda x, u: rate(x, u, parameters), x, u, h, substeps), h * running(x, u, parameters)
 
 
 CART = ControlProblem(
-    stage=stage,
-    model=lambda *arguments: stage(*arguments, substeps=1),
+    interval=lambda *arguments: stage(*arguments)[0],
+    rate=rate,
+    running=running,
     start=np.zeros(2),
     goal=np.array([1.0, 0.0]),
     state_limits=np.array([np.inf, SPEED]),
@@ -44,17 +49,23 @@ CART = ControlProblem(
 )
 
 
-def guesses():
-    """The straight line, slow and fast, with ends that the solver has to pin."""
+def guess(h):
+    """The straight line, with ends that the solver has to pin."""
     line = np.stack([np.linspace(0.2, 1, N + 1), np.full(N + 1, 0.5)], 1)
-    return Guess(jnp.stack([line, line], -1), jnp.zeros((N, 1, 2)), jnp.array([0.3, 0.1]))
+    return Guess(jnp.asarray(line), jnp.zeros((N, 1)), jnp.asarray(h))
 
 
 @jax.jit
-def optimize(parameters, max_iterations):
-    """Both guesses of every problem, [.. P 2]; three lanes, so that they are refilled."""
-    solution = solve(CART, parameters, guesses(), Settings(lanes=3, max_iterations=max_iterations))
-    return jax.tree.map(lambda leaf: leaf.reshape(*leaf.shape[:-1], -1, 2), solution)
+def optimize(parameters, allowance):
+    """Every problem from a slow and a fast guess, [.. P 2]: the last of three copies, on lanes that are refilled."""
+    thrice = lambda leaf: jnp.tile(leaf, 3)  # noqa: E731
+    allowance = thrice(jnp.broadcast_to(jnp.asarray(allowance), parameters["time"].shape))
+
+    def from_guess(h):
+        copies = solve(CART, jax.tree.map(thrice, parameters), guess(h), allowance, Settings(lanes=8))
+        return jax.tree.map(lambda leaf: leaf[..., -6:], copies)
+
+    return jax.tree.map(lambda leaf: jnp.moveaxis(leaf, 0, -1), jax.lax.map(from_guess, jnp.array([0.3, 0.1])))
 
 
 @pytest.fixture(scope="module")
@@ -153,7 +164,7 @@ def test_defects_and_costs_are_those_of_the_accurate_stage(solution):
         assert solution.cost[index, 0] == pytest.approx(float(np.sum(costs)), rel=1e-12)
     parameters = {key: values[SWAYING] for key, values in PARAMETERS.items()}
     xs, us, h = (leaf[..., SWAYING, 0] for leaf in (solution.xs, solution.us, solution.h))
-    coarse, _ = CART.model(xs[:-1].T, us.T, h, parameters)
+    coarse, _ = stage(xs[:-1].T, us.T, h, parameters, substeps=1)
     assert np.max(np.abs(coarse.T - xs[1:])) > 1e-7
 
 
@@ -168,6 +179,15 @@ def test_iterations_are_counted_to_the_one_that_solves(solution):
     assert np.all(optimize(PARAMETERS, needed).solved[:4])
     one_less = optimize(PARAMETERS, needed - 1)
     np.testing.assert_array_equal(one_less.solved[:4], solution.iterations[:4] < needed)
+
+
+def test_problems_without_allowance_are_left_out_and_change_no_other(solution):
+    some = jax.tree.map(np.asarray, optimize(PARAMETERS, np.where(np.isin(np.arange(6), [FAST, WEAK]), 0, MOST)))
+    others = [FRUGAL, SLOW_CART, SWAYING, BROKEN]
+    for theirs, ours in zip(some, solution, strict=True):
+        np.testing.assert_array_equal(theirs[..., others, :], ours[..., others, :])
+    assert not np.any(some.solved[[FAST, WEAK]])
+    np.testing.assert_array_equal(some.iterations[[FAST, WEAK]], 0)
 
 
 def test_a_problem_does_not_notice_its_neighbours(solution):
@@ -186,7 +206,7 @@ def test_a_problem_does_not_notice_its_neighbours(solution):
 
 def test_single_precision_stays_single():
     parameters = {key: jax.ShapeDtypeStruct((6,), jnp.float32) for key in PARAMETERS}
-    single = Guess(*(jnp.asarray(leaf, jnp.float32) for leaf in guesses()))
-    shapes = jax.eval_shape(lambda parameters: solve(CART, parameters, single), parameters)
+    single = Guess(*(jnp.asarray(leaf, jnp.float32) for leaf in guess(0.3)))
+    shapes = jax.eval_shape(lambda parameters: solve(CART, parameters, single, jnp.full(6, MOST)), parameters)
     for name in ("us", "xs", "h", "cost", "defect"):
         assert getattr(shapes, name).dtype == jnp.float32

@@ -1,5 +1,7 @@
 """The Riccati sweep against the dense KKT matrix, and its flag against the reduced Hessian's eigenvalues."""
 
+from typing import NamedTuple
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -11,13 +13,33 @@ from rtcd_jax.numerics import kkt
 N, n, m, P = 6, 3, 2, 4
 w = n + 1 + m
 
-solve = jax.jit(kkt.solve)
+
+class Dense(NamedTuple):
+    """A subproblem as whole arrays."""
+
+    hessians: np.ndarray
+    gradients: np.ndarray
+    jacobians: np.ndarray
+    defects: np.ndarray
+    curvature: np.ndarray
+    slope: np.ndarray
+
+
+def entries(array):
+    """[N i j .. P] as nested lists of [N P]."""
+    return [entries(array[:, i]) for i in range(array.shape[1])] if array.ndim > 2 else jnp.asarray(array)
+
+
+@jax.jit
+def solve(dense):
+    hessian, gradient, jacobian = entries(dense.hessians), entries(dense.gradients), entries(dense.jacobians)
+    return kkt.solve(kkt.Subproblem(hessian, gradient, jacobian, dense.defects, dense.curvature, dense.slope))
 
 
 def random_subproblem(seed=0):
     random = np.random.default_rng(seed)
     root = random.normal(size=(N, w, w, P))
-    return kkt.Subproblem(
+    return Dense(
         hessians=np.einsum("kijp,kljp->kilp", root, root) + 0.1 * np.eye(w)[:, :, None],
         gradients=random.normal(size=(N, w, P)),
         jacobians=random.normal(size=(N, n, w, P)),
@@ -78,6 +100,27 @@ def test_the_step_is_the_dense_solution():
         exact = np.linalg.solve(matrix, -np.concatenate([gradient, offsets]))
         ours = np.concatenate([unknowns(step, p), np.ravel(step.multipliers[..., p])])
         np.testing.assert_allclose(ours, exact, rtol=1e-7, atol=1e-9 * np.max(np.abs(exact)))
+
+
+def test_known_numbers_are_entries_like_others():
+    """Structure of a robot: a column of the slopes that is zero, a slope of one, a Hessian with zeros."""
+    problem = random_subproblem()
+    for array, where, number in (
+        (problem.jacobians, (slice(None), slice(None), 0), 0.0),
+        (problem.jacobians, (slice(None), 0, 0), 1.0),
+        (problem.hessians, (slice(None), 0, slice(1, None)), 0.0),
+        (problem.hessians, (slice(None), slice(1, None), 0), 0.0),
+        (problem.gradients, (slice(None), 1), 0.0),
+    ):
+        array[where] = number
+
+    def number(entry):
+        return float(entry[0, 0]) if np.all(entry == entry[0, 0]) else jnp.asarray(entry)
+
+    lists = (jax.tree.map(number, entries(a)) for a in (problem.hessians, problem.gradients, problem.jacobians))
+    structured = kkt.solve(kkt.Subproblem(*lists, problem.defects, problem.curvature, problem.slope))
+    for ours, theirs in zip(structured, solve(problem), strict=True):
+        np.testing.assert_allclose(ours, theirs, rtol=1e-9, atol=1e-10)
 
 
 def test_both_ends_stay_pinned_exactly():
@@ -143,5 +186,5 @@ def test_batch_is_one_by_one():
 
 def test_single_precision_stays_single():
     single = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape, jnp.float32), random_subproblem())
-    step = jax.eval_shape(kkt.solve, single)
+    step = jax.eval_shape(solve, single)
     assert [leaf.dtype for leaf in step] == [jnp.float32] * 4 + [jnp.bool]

@@ -16,7 +16,7 @@ class State(NamedTuple):
     scaled: jax.Array
 
 
-def halve(starts, width):
+def halve(starts, width, wanted=None):
     """Number of halvings [P] of every start, and [2 P] the last values, once and tripled."""
     starts = jnp.asarray(starts)
 
@@ -38,7 +38,7 @@ def halve(starts, width):
     def extract(state):
         return state.halvings, state.scaled
 
-    return solve_in_lanes(load, advance, finished, extract, len(starts), width)
+    return solve_in_lanes(load, advance, finished, extract, len(starts), width, wanted)
 
 
 def halvings(starts):
@@ -52,6 +52,15 @@ def test_every_problem_gets_its_own_answer_at_its_own_place(count, width):
     counted, scaled = jax.jit(halve, static_argnums=1)(starts, width)
     np.testing.assert_array_equal(counted, halvings(starts))
     np.testing.assert_array_equal(scaled, np.array([[1.0], [3.0]]) * starts / 2.0 ** halvings(starts))
+
+
+@pytest.mark.parametrize("wanted", [0, 1, 5, 12, 19, 20])
+def test_only_those_wanted_are_solved(wanted):
+    """One program for all: the number is data. Unwanted problems would never finish."""
+    starts = np.where(np.arange(20) < wanted, 2.0 ** np.random.default_rng(0).uniform(-1, 30, 20), np.inf)
+    counted, _ = jax.jit(halve, static_argnums=1)(starts, 4, wanted)
+    np.testing.assert_array_equal(counted[:wanted], halvings(starts[:wanted]))
+    np.testing.assert_array_equal(counted[wanted:], 0)
 
 
 def test_stragglers_cost_only_themselves():
