@@ -10,6 +10,8 @@ the ellipsoids of the previous W, a fixed point in a few rounds. The TVLQR's sha
 instant; here the shape is free (Tobenkin, Manchester, Tedrake 2011, alternate between multipliers and V to that end).
 """
 
+import itertools
+
 import numpy as np
 from scipy.linalg import expm
 from scipy.optimize import linprog
@@ -28,9 +30,11 @@ SETTLING = 0.02
 SHARE_OF_LIMIT = 0.99
 WIDEST = 2.0
 """Largest half width [rad] along the angle: beyond it polynomials follow the sine badly."""
+LONGEST = 0.05
+"""Longest interval [s] of predictions: one W for a longer one is too coarse."""
 PREDICTED_SPARE = 0.02
 """Spare rate [1/s] of predictions."""
-KEPT_INLET = 0.8
+KEPT_INLET = 0.5
 """Share of the TVLQR's inlet that an optimized funnel must keep to be preferred."""
 
 
@@ -81,11 +85,13 @@ def _limits(loop: Loop, k: int, share: float, axes: np.ndarray, pairs: list) -> 
 def predicted(loop: Loop, axes: np.ndarray, evenness: float, y: np.ndarray) -> np.ndarray | None:
     """Volumes [N+1], knots first, up to the unit ball's, if every interval goes through; None if it cannot."""
     volumes = [np.linalg.det(axes)]
+    shares = np.linspace(1, 0, int(np.ceil(loop.dt / LONGEST)) + 1)
     for k in range(len(loop.u) - 1, -1, -1):
-        w = fastest_growth(loop, k, 0.0, 1.0, axes, PREDICTED_SPARE, evenness, y)
-        if w is None:
-            return None
-        axes = axes @ expm(-w * loop.dt)
+        for end, start in itertools.pairwise(shares):
+            w = fastest_growth(loop, k, start, end, axes, PREDICTED_SPARE, evenness, y)
+            if w is None:
+                return None
+            axes = axes @ expm(-w * (end - start) * loop.dt)
         volumes.append(np.linalg.det(axes))
     return np.array(volumes[::-1])
 

@@ -93,6 +93,9 @@ def _events(
     folder: Path, names: Sequence[str], rung: str, workers: int, optimize_value: bool
 ) -> Iterator[Step | tuple[str, Outcome | None]]:
     """Steps of all elites as they come, and every elite's outcome by its name."""
+    # One thread each: there is a worker for every core, and small matrices in many threads cost ten times as much.
+    for library in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
+        os.environ.setdefault(library, "1")
     context = multiprocessing.get_context("spawn")
     steps = context.Queue()
     pool = ProcessPoolExecutor(min(workers, len(names)), context, _remember, (steps,))
@@ -112,10 +115,9 @@ _steps: Any = None
 
 
 def _remember(steps: Any) -> None:
-    """In a worker: where its progress goes. One thread each, since there is a worker for every core."""
+    """In a worker: where its progress goes."""
     global _steps
     _steps = steps
-    os.environ["OMP_NUM_THREADS"] = "1"
 
 
 def _work(folder: Path, name: str, rung: str, optimize_value: bool) -> Outcome | None:
