@@ -1075,12 +1075,12 @@ def sentence(name: str, report: Report) -> str:
         f"claimed controller, whose input never exceeds {float(claim.limit):.6g} {plant.input_unit}: every motion that "
         f"is in the funnel at some time of [{report.start:.6g} s, {report.end:.6g} s] stays in it, is in the goal "
         f"region at {report.end:.6g} s, never leaves that region, and comes and stays within "
-        f"{max(report.rest):.1g} of the goal in every state; {kept or 'there is no limit on a state'} all the while. Half widths: "
-        f"{extent('inlet')}; {extent('outlet')}; {extent('goal')}. Volumes (proved) [{unit}]: inlet {v['inlet']:.6g}, "
-        f"sum over the knots {v['sum']:.6g}, integral over time {v['integral']:.6g} s, goal region {v['goal']:.6g}. "
-        f"{report.stretches} intervals of time and {report.shells} of level, smallest margin {report.margin:.2g}. It "
-        "is a statement about "
-        "this model, its state known and its input continuous, not about hardware."
+        f"{max(report.rest):.1g} of the goal in every state; {kept or 'there is no limit on a state'} all the while. "
+        f"Half widths: {extent('inlet')}; {extent('outlet')}; {extent('goal')}. Volumes (proved) [{unit}]: inlet "
+        f"{v['inlet']:.6g}, sum over the knots {v['sum']:.6g}, integral over time {v['integral']:.6g} s, goal region "
+        f"{v['goal']:.6g}. {report.stretches} intervals of time and {report.shells} of level, smallest margin "
+        f"{report.margin:.2g}. It is a statement about this model, its state known and its input continuous, not about "
+        "hardware."
     )
 
 

@@ -127,7 +127,7 @@ def _work(folder: Path, name: str, rung: str, optimize_value: bool) -> Outcome |
 def rank_correlation(outcomes: Sequence[Outcome]) -> float:
     """Spearman's, between the sampled and the shown sums of volumes: 1 if the proof would rank the elites the same."""
     sums = [[outcome.sampled["sum"], outcome.found["sum"]] for outcome in outcomes]
-    return float(spearmanr(sums).statistic)
+    return float(spearmanr(sums)[0])
 
 
 def _summary(outcome: Outcome | None) -> dict[str, Any] | None:
