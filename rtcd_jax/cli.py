@@ -50,7 +50,32 @@ def verify(arguments: Sequence[str]) -> int:
     return OK if held else BROKEN_PROMISE
 
 
-VERBS: dict[str, Callable[[Sequence[str]], int]] = {"optimize": optimize, "verify": verify}
+def certify(arguments: Sequence[str]) -> int:
+    """prove the funnels of a run's elites by sums of squares"""
+    from rtcd_jax.options import read_certify
+
+    options = read_certify(arguments)
+    from rtcd_jax.certificate.run import certify_run
+    from rtcd_jax.console import Console
+
+    with Console() as console:
+        whole = certify_run(options.run, options.elites, options.rung, options.workers, console, options.optimize_value)
+    return OK if whole else BROKEN_PROMISE
+
+
+def check(arguments: Sequence[str]) -> int:
+    """check a certificate file by exact arithmetic, without any solver"""
+    from rtcd_jax.certificate.check import main as check_main
+
+    return check_main(arguments)
+
+
+VERBS: dict[str, Callable[[Sequence[str]], int]] = {
+    "optimize": optimize,
+    "verify": verify,
+    "certify": certify,
+    "check": check,
+}
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -159,6 +159,19 @@ class TrajectoryConfig(Settings):
     )
 
 
+class PolicyConfig(Settings):
+    """What the tracking controller's Riccati equation changes of Q and R; the defaults are the paper's TVLQR."""
+
+    input_weight: float = Field(default=1.0, gt=0, description="R of the controller over that of the trajectory [-]")
+    authority: float = Field(
+        default=1.0,
+        gt=0,
+        le=1,
+        description="R grows to R / max(1 - |u*| / u_max, authority)^2 where u* leaves little of the input [-]",
+    )
+    discount: float = Field(default=0.0, ge=0, description="alpha: V falls as if A were A + alpha I [1/s]")
+
+
 class GoalConfig(Settings):
     """The region of attraction of the goal's LQR, from which the last level follows."""
 
@@ -252,6 +265,7 @@ class Config(Settings):
     design: dict[str, Variable] = Field(description="the plant's design fields by name")
     weights: WeightsConfig = Field(description="cost weights, searched on a log scale")
     trajectory: TrajectoryConfig = Field(default=TrajectoryConfig(), description="the nominal motion")
+    policy: PolicyConfig = Field(default=PolicyConfig(), description="the controller that tracks it")
     funnel: FunnelConfig = Field(default=FunnelConfig(), description="how the funnel is sampled")
     search: SearchConfig = Field(default=SearchConfig(), description="CMA-ES over designs and weights")
     elites: ElitesConfig = Field(default=ElitesConfig(), description="the archive of the best")

@@ -3,7 +3,7 @@
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, cast
+from typing import Annotated, Any, Literal, cast
 
 import tyro
 from pydantic.fields import FieldInfo
@@ -45,6 +45,21 @@ class VerifyOptions:
     seed: Annotated[int, tyro.conf.arg(help="of the states [-] (>= 0)")] = 0
 
 
+@dataclass(frozen=True)
+class CertifyOptions:
+    """Prove the funnels of a run's best elites by sums of squares; `rtcd check` checks what this writes.
+
+    Rungs: certified, by the solver's floating-point numbers; proved, by exact arithmetic for the true dynamics. The
+    same command goes on after a kill. Exit code 1 if a funnel was not shown from t = 0 to the goal.
+    """
+
+    run: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RUN", help="the run folder")]
+    elites: Annotated[int, tyro.conf.arg(help="how many, the best first [-] (>= 1)")] = 1
+    rung: Annotated[Literal["certified", "proved"], tyro.conf.arg(help="how much is to be shown")] = "proved"
+    optimize_value: Annotated[bool, tyro.conf.arg(help="free the ellipsoids' shape where that enlarges it")] = False
+    workers: Annotated[int, tyro.conf.arg(help="processes, one elite each [-] (>= 1)")] = 2
+
+
 def read_optimize(arguments: Sequence[str], runs: Path) -> tuple[Config, Path]:
     """The configuration with its overrides, and the run folder.
 
@@ -68,6 +83,17 @@ def read_verify(arguments: Sequence[str]) -> VerifyOptions:
         raise UserError(f"--states = {options.states}: must be >= 1")
     if options.seed < 0:
         raise UserError(f"--seed = {options.seed}: must be >= 0")
+    if not options.run.is_dir():
+        raise UserError(f"{options.run}: no such run folder; `{OPTIMIZE_USAGE}` makes one")
+    return options
+
+
+def read_certify(arguments: Sequence[str]) -> CertifyOptions:
+    """The checked options of `rtcd certify`; `UserError` if one is out of range."""
+    options = tyro.cli(CertifyOptions, args=arguments, prog="rtcd certify", use_underscores=True)
+    for name in ("elites", "workers"):
+        if getattr(options, name) < 1:
+            raise UserError(f"--{name} = {getattr(options, name)}: must be >= 1")
     if not options.run.is_dir():
         raise UserError(f"{options.run}: no such run folder; `{OPTIMIZE_USAGE}` makes one")
     return options

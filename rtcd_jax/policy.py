@@ -3,6 +3,10 @@
 S solves -S' = A'S + S A - S B R^-1 B' S + Q backward along (x*, u*), from the value matrix of the goal's own
 infinite-horizon LQR with the same Q and R; K = R^-1 B' S (paper, section II-C). The whole closed loop thereby has one
 value function that continues through t_N.
+
+The configuration's `policy` may make the controller leave authority: A becomes A + alpha I, and R becomes
+w R / max(1 - |u*| / u_max, authority)^2 with the interval's own u*. The defaults, alpha = 0 and w = authority = 1,
+change nothing.
 """
 
 from functools import partial
@@ -65,8 +69,9 @@ def stabilize(problem: Problem, candidate: Candidate, trajectory: Trajectory) ->
     motion = nominal(problem, candidate, trajectory)
     middles = (np.arange(substeps) + 0.5) / substeps
     xs = motion.at(middles)
+    weights = input_weights(problem, candidate, motion.inputs)
     us = jnp.broadcast_to(motion.inputs[:, :, None], (problem.plant.m, *xs.shape[1:]))
-    pieces = _interval(problem, candidate, xs, us, trajectory.dt / substeps)
+    pieces = _interval(problem, candidate, xs, us, weights[..., None], trajectory.dt / substeps)
     whole = jax.tree.map(lambda leaf: leaf[..., 0], pieces)
     for piece in range(1, substeps):
         whole = riccati.compose(whole, jax.tree.map(lambda leaf, piece=piece: leaf[..., piece], pieces))
@@ -83,7 +88,8 @@ def stabilize(problem: Problem, candidate: Candidate, trajectory: Trajectory) ->
     values = jnp.concatenate([values, last[None]])
     inputs = jnp.concatenate([motion.inputs, jnp.zeros_like(motion.inputs[:, :1])], 1)
     _, b = linearize(problem, candidate, trajectory.xs.T, inputs)
-    gains = mm(transpose(b) / candidate.r[:, None, None], jnp.moveaxis(values, 0, -1))
+    weights = input_weights(problem, candidate, inputs)
+    gains = mm(transpose(b) / weights[:, None], jnp.moveaxis(values, 0, -1))
     status = jnp.where(definite, Status.OK, Status.RICCATI_INDEFINITE)
     return Policy(trajectory, jnp.moveaxis(gains, -1, 0), values, first_failure(trajectory.status, status))
 
@@ -91,16 +97,32 @@ def stabilize(problem: Problem, candidate: Candidate, trajectory: Trajectory) ->
 def goal_value(problem: Problem, candidate: Candidate):
     """S [n n] of the goal's infinite-horizon LQR, and whether it exists."""
     goal = jnp.asarray(problem.goal, candidate.q.dtype)
-    a, b = linearize(problem, candidate, goal, jnp.zeros(problem.plant.m, goal.dtype))
-    return riccati.infinite_horizon(a, _spread(b, candidate.r), jnp.diag(candidate.q))
+    rest = jnp.zeros(problem.plant.m, goal.dtype)
+    a, b = _discounted(problem, *linearize(problem, candidate, goal, rest))
+    weights = input_weights(problem, candidate, rest)
+    return riccati.infinite_horizon(a, _spread(b, weights), jnp.diag(candidate.q))
 
 
-def _interval(problem: Problem, candidate: Candidate, xs, us, duration) -> riccati.Interval:
-    a, b = linearize(problem, candidate, xs, us)
+def input_weights(problem: Problem, candidate: Candidate, us):
+    """The diagonal of the controller's R [m ...] where the feed-forward is `us` [m ...]."""
+    policy, behind = problem.config.policy, (1,) * (us.ndim - 1)
+    limits = jnp.asarray(problem.input_limits, us.dtype).reshape(-1, *behind)
+    left = jnp.maximum(1 - jnp.abs(us) / limits, policy.authority)
+    return policy.input_weight * candidate.r.reshape(-1, *behind) / left**2
+
+
+def _interval(problem: Problem, candidate: Candidate, xs, us, weights, duration) -> riccati.Interval:
+    a, b = _discounted(problem, *linearize(problem, candidate, xs, us))
     cost = jnp.broadcast_to(jnp.diag(candidate.q)[:, :, None, None], a.shape)
-    return riccati.constant_interval(a, _spread(b, candidate.r), cost, duration, DOUBLINGS)
+    return riccati.constant_interval(a, _spread(b, weights), cost, duration, DOUBLINGS)
 
 
-def _spread(b, r):
-    """B R^-1 B'."""
-    return mm(b / r.reshape(1, -1, *(1,) * (b.ndim - 2)), transpose(b))
+def _discounted(problem: Problem, a, b):
+    """A + alpha I, and B."""
+    identity = jnp.eye(a.shape[0], dtype=a.dtype).reshape(a.shape[0], -1, *(1,) * (a.ndim - 2))
+    return a + problem.config.policy.discount * identity, b
+
+
+def _spread(b, weights):
+    """B R^-1 B' for the diagonal of R [m ...]."""
+    return mm(b / weights[None], transpose(b))

@@ -50,6 +50,7 @@ def record_of(problem: Problem, effort: Effort, evaluation: Evaluation) -> dict[
         "parameters": plant.parameters(design),
         "design": {name: float(getattr(design, name)) for name in plant.design_units},
         "weights": {"q": host.candidate.q, "r": host.candidate.r},
+        "policy": config.policy.model_dump(),
         "units": {
             "states": dict(zip(plant.state_names, plant.state_units, strict=True)),
             "inputs": dict(zip(plant.input_names, plant.input_units, strict=True)),

@@ -32,9 +32,11 @@ LAYERS = (
 OWNERS = {
     "mujoco": {"plants.mjx", "report"},
     "cvxpy": {"certificate"},
+    "clarabel": {"certificate"},
+    "flint": {"certificate"},
     "orbax": {"storage"},
     "evosax": {"cmaes"},
-    "rich": {"console", "verify", "report"},
+    "rich": {"console", "verify", "certificate", "report"},
     "tyro": {"options"},
     "yaml": {"config"},
     "matplotlib": {"report"},
@@ -49,10 +51,11 @@ ALONE = {
     "console": set(),
     "files": {"errors"},
     "cmaes": {"cmaes", "numerics", "errors"},
+    "certificate.check": set(),
 }
 
 # Modules that must start fast, so that wrong input is refused at once.
-QUICK = ("cli", "console", "config", "errors", "options", "settings")
+QUICK = ("cli", "console", "config", "errors", "options", "settings", "certificate.check")
 HEAVY = {"jax", "jaxtyping", "equinox", "evosax", "mujoco", "orbax", "scipy", "numpy", "matplotlib", "cvxpy"}
 
 

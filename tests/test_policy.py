@@ -14,7 +14,7 @@ from scipy.interpolate import CubicHermiteSpline
 
 from rtcd_jax.config import load
 from rtcd_jax.plants.pendulum import PendulumDesign
-from rtcd_jax.policy import linearize, nominal, stabilize
+from rtcd_jax.policy import goal_value, linearize, nominal, stabilize
 from rtcd_jax.problem import make_problem
 from rtcd_jax.trajectory import plan
 from rtcd_jax.types import Candidate, Status
@@ -217,3 +217,57 @@ def test_dtype_and_shapes_are_kept(problem, candidates, planned, dtype):
     policy = jax.eval_shape(partial(stabilize, problem), *jax.tree.map(cast, (candidates, planned)))
     assert policy.values == jax.ShapeDtypeStruct((51, 2, 2), dtype)
     assert policy.gains == jax.ShapeDtypeStruct((51, 1, 2), dtype)
+
+
+OPTIONS = {"input_weight": 0.3, "authority": 0.2, "discount": 0.7}
+
+
+@pytest.fixture(scope="module")
+def cautious(problem):
+    policy = problem.config.policy.model_copy(update=OPTIONS)
+    return dataclasses.replace(problem, config=problem.config.model_copy(update={"policy": policy}))
+
+
+def test_the_defaults_are_the_paper_s(problem):
+    assert problem.config.policy.model_dump() == {"input_weight": 1.0, "authority": 1.0, "discount": 0.0}
+
+
+def test_options_solve_their_own_riccati_equation(problem, cautious, candidates, planned):
+    """S' = -((A + aI)'S + S (A + aI) - S B R^-1 B'S + Q) at the middle of intervals, R that of the interval's input."""
+    soft, trajectory = take(candidates, SOFT), take(planned, SOFT)
+    policy = jax.jit(partial(stabilize, cautious))(soft, trajectory)
+    assert policy.status == Status.OK
+    h, s = float(trajectory.dt), np.asarray(policy.values)
+    motion = nominal(problem, soft, trajectory)
+    inputs = np.asarray(trajectory.us)[:, 0]
+    left = np.maximum(1 - np.abs(inputs) / 2.5, 0.2)
+    weights = 0.3 * R[SOFT, 0] / left**2
+    assert weights.max() > 5 * weights.min()
+    for k in range(0, len(inputs), 7):
+        found = solve_ivp(
+            lambda t, v, k=k: _riccati_rate(problem, soft, motion, k, 1 - t / h, v, inputs[k], weights[k]),
+            (0, h),
+            s[k + 1].ravel(),
+            rtol=1e-10,
+            atol=1e-10,
+        ).y[:, -1]
+        np.testing.assert_allclose(found.reshape(2, 2), s[k], rtol=3e-3)  # five substeps an interval
+        _, b = linearize(problem, soft, trajectory.xs[k], trajectory.us[k])
+        np.testing.assert_allclose(policy.gains[k], np.asarray(b).T @ s[k] / weights[k], rtol=1e-9)
+
+
+def _riccati_rate(problem, candidate, motion, k, share, v, u, weight):
+    s = v.reshape(2, 2)
+    x = np.asarray(motion.at(np.array([share])))[:, k, 0]
+    a, b = (np.asarray(each) for each in linearize(problem, candidate, jnp.asarray(x), jnp.asarray([u])))
+    a = a + 0.7 * np.eye(2)
+    return (a.T @ s + s @ a - s @ b @ b.T @ s / weight + np.diag(candidate.q)).ravel()
+
+
+def test_the_goal_s_lqr_is_discounted_too(problem, cautious, candidates):
+    soft = take(candidates, SOFT)
+    a, b = (np.asarray(m) for m in linearize(problem, soft, jnp.asarray(problem.goal), jnp.zeros(1)))
+    expected = scipy.linalg.solve_continuous_are(a + 0.7 * np.eye(2), b, np.diag(Q[SOFT]), 0.3 * R[SOFT][:, None])
+    found, reached = goal_value(cautious, soft)
+    assert reached
+    np.testing.assert_allclose(found, expected, rtol=1e-8)

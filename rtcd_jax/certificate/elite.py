@@ -1,0 +1,228 @@
+"""One elite's certificate: goal region, then funnel, every step kept on disk, so that a killed search goes on."""
+
+import json
+import time
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any, NamedTuple, final
+
+import numpy as np
+
+from rtcd_jax.certificate import check
+from rtcd_jax.certificate.check import Claim, Node, Witness
+from rtcd_jax.certificate.descent import AIMS_SHARED, SPARE, Descent, Front, directions
+from rtcd_jax.certificate.flow import best_evenness
+from rtcd_jax.certificate.goal import GoalRegion, goal_region
+from rtcd_jax.certificate.loop import Loop, claim_of, double, doubles, sealed
+from rtcd_jax.files import replace, writing
+from rtcd_jax.storage import read_elite
+
+RUNGS = ("certified", "proved")
+
+
+class Step(NamedTuple):
+    """How far an elite's certificate is: the interval and time [s] reached, rho there, its margin [1/s]."""
+
+    elite: str
+    knot: int
+    knots: int
+    time: float
+    rho: float
+    margin: float
+
+
+class Outcome(NamedTuple):
+    """A finished certificate beside what was sampled; volumes over the knots from `start` [s] on."""
+
+    elite: str
+    rung: str
+    start: float
+    intervals: int
+    seconds: float
+    sampled: dict[str, float]
+    found: dict[str, float]
+
+    @property
+    def whole(self) -> bool:
+        """Whether the funnel reaches back to t = 0."""
+        return self.start == 0.0
+
+
+@final
+class Journal:
+    """The finished steps of one elite's certificate, one JSON line each; the first line says of which claim and rung.
+
+    Lines of another claim or rung, and a torn last one, are dropped.
+    """
+
+    def __init__(self, path: Path, head: Mapping[str, Any]):
+        self.path = path
+        lines = []
+        if path.is_file():
+            with path.open("rb") as file:
+                lines = [json.loads(line) for line in file if line.endswith(b"\n")]
+        self.lines = lines[1:] if lines and lines[0] == head else []
+        replace(path, "".join(f"{json.dumps(line)}\n" for line in (head, *self.lines)).encode())
+
+    def append(self, line: Mapping[str, Any]) -> None:
+        self.lines.append(dict(line))
+        with writing(self.path), self.path.open("ab") as file:
+            file.write(f"{json.dumps(line)}\n".encode())
+
+
+def certify_elite(
+    run: Path, name: str, rung: str, on_step: Callable[[Step], None], optimize_value: bool = False
+) -> Outcome | None:
+    """Writes `certificates/NAME.json` of a run folder; None if not even a goal region can be shown.
+
+    `optimize_value` frees the ellipsoids' shape where that is predicted to enlarge the funnel.
+
+    Raises:
+        UserError: an elite that is not there, or of a plant that the checker does not know.
+    """
+    began = time.perf_counter()
+    arrays, record = read_elite(run / "elites", name)
+    told, folder = claim_of(arrays, record), run / "certificates"
+    claim = _claim(told, len(arrays["u"]), 1.0)
+    loop, exact = Loop(claim, arrays, record.get("policy")), rung == "proved"
+    journal = Journal(
+        folder / f".{name}.partial.jsonl", {"claim": check.seal(told), "rung": rung, "optimize_value": optimize_value}
+    )
+    region = _region(claim, loop, exact, journal)
+    if region is None:
+        return None
+    goal, outlet = region
+    descent = Descent(claim, loop, exact, _evenness(loop, outlet, arrays, journal) if optimize_value else None)
+    front = _front(descent, claim, outlet, journal)
+    for proved in descent.down_from(front):
+        piece = proved.piece
+        journal.append(
+            {"stretch": _stretch_record(piece), "rho": proved.rho, "spare": proved.spare, "margin": proved.margin}
+        )
+        at = (piece.knot + float(piece.start)) * loop.dt
+        on_step(Step(name, piece.knot, len(loop.u), at, proved.rho, proved.margin))
+    seconds = time.perf_counter() - began
+    stretches = [line["stretch"] for line in journal.lines if "stretch" in line][::-1]
+    if not stretches:
+        return None
+    start = [stretches[0]["knot"], stretches[0]["start"]]
+    content = {
+        "format": check.FORMAT,
+        "version": check.VERSION,
+        "claim": sealed({**told, "start": start}),
+        "funnel": stretches,
+        "goal": goal,
+        "notes": {"elite": name, "rung at writing": rung},
+    }
+    return _finish(folder / f"{name}.json", sealed(content), arrays, rung, seconds, journal)
+
+
+def _finish(
+    path: Path, content: dict[str, Any], arrays: Mapping[str, np.ndarray], rung: str, seconds: float, journal: Journal
+) -> Outcome:
+    """The written certificate; on the rung *proved* it was accepted as a whole before."""
+    if rung == "proved":
+        check.check(content)
+    replace(path, (json.dumps(content, separators=(",", ":")) + "\n").encode())
+    journal.path.unlink()
+    claim = check.read_claim(Node("claim", content["claim"]))
+    pieces = [check.read_stretch(Node("funnel", each), claim) for each in content["funnel"]]
+    axes = Node("goal.axes", content["goal"]["axes"]).array(claim.n, claim.n)
+    found, _ = check.volumes_of(claim, pieces, axes)
+    start = float(pieces[0].knot + pieces[0].start)
+    per_knot, step = np.asarray(arrays["volumes_per_knot"])[int(np.ceil(start)) :], float(arrays["time"][1])
+    sampled = {
+        "inlet": float(per_knot[0]),
+        "sum": float(per_knot.sum()),
+        "integral": float(np.trapezoid(per_knot, dx=step)),
+        "goal": float(per_knot[-1]),
+    }
+    return Outcome(path.stem, rung, start * step, len(pieces), seconds, sampled, found)
+
+
+def _claim(told: Mapping[str, Any], knot: int, share: float) -> Claim:
+    start = [knot - 1, double(share)]
+    return check.read_claim(Node("claim", sealed({**told, "start": start})))
+
+
+def _region(claim: Claim, loop: Loop, exact: bool, journal: Journal) -> tuple[dict[str, Any], float] | None:
+    """The goal's record and the outlet's level, from the journal if they are there."""
+    for line in journal.lines:
+        if "goal" in line:
+            return line["goal"], line["outlet"]
+    region = goal_region(claim, loop, exact)
+    if region is None:
+        return None
+    goal = _goal_record(region)
+    journal.append({"goal": goal, "outlet": region.outlet})
+    return goal, region.outlet
+
+
+def _evenness(loop: Loop, outlet: float, arrays: Mapping[str, np.ndarray], journal: Journal) -> float | None:
+    """How the shape is freed, from the journal if it is there; None keeps the elite's S."""
+    for line in journal.lines:
+        if "evenness" in line:
+            return line["evenness"]
+    last, aims = len(loop.u) - 1, directions(loop.n)[:, ::AIMS_SHARED]
+    axes, _ = loop.axes(last, 1.0, outlet, 0.0)
+    evenness = best_evenness(loop, axes, np.asarray(arrays["rho"]), aims)
+    journal.append({"evenness": evenness})
+    return evenness
+
+
+def _front(descent: Descent, claim: Claim, outlet: float, journal: Journal) -> Front:
+    """Where the journal ends."""
+    front = descent.outlet(outlet)
+    for line in journal.lines:
+        if "stretch" in line:
+            piece = check.read_stretch(Node("journal", line["stretch"]), claim)
+            rates = SPARE[claim.n]
+            place = rates.index(line["spare"]) if line["spare"] in rates else len(rates) - 1
+            trial = descent.next_trial(place, line["margin"])
+            front = Front(piece.knot, float(piece.start), line["rho"], piece.first, trial)
+    return front
+
+
+def _stretch_record(piece: check.Stretch) -> dict[str, Any]:
+    return sealed(
+        {
+            "knot": piece.knot,
+            "start": double(piece.start),
+            "end": double(piece.end),
+            "first": _matrix(piece.first),
+            "last": _matrix(piece.last),
+            "bend": [_matrix(each) for each in piece.bend],
+            "orders": list(piece.orders),
+            "cases": _cases_record(piece.cases),
+        }
+    )
+
+
+def _goal_record(region: GoalRegion) -> dict[str, Any]:
+    """The weight of the S-lemma lies between those that the two scaled copies of one ellipsoid allow."""
+    determinant = float(np.linalg.det(np.array([[float(c) for c in row] for row in region.axes])))
+    weight = determinant**2 * (1 + region.outlet / region.rho) / 2
+    shells = [
+        sealed({"start": double(s.start), "end": double(s.end), "cases": _cases_record(s.cases)}) for s in region.shells
+    ]
+    record = {"axes": _matrix(region.axes), "order": region.order, "weight": double(weight), "shells": shells}
+    return sealed(record)
+
+
+def _cases_record(cases: Mapping[str, Witness]) -> dict[str, Any]:
+    return {
+        case: {
+            "degree": witness.degree,
+            "gram": [_triangle(matrix) for matrix in witness.gram],
+            "multipliers": [[_triangle(matrix) for matrix in each] for each in witness.multipliers],
+        }
+        for case, witness in cases.items()
+    }
+
+
+def _matrix(matrix: list[list]) -> Any:
+    return doubles([[float(c) for c in row] for row in matrix])
+
+
+def _triangle(matrix: list[list]) -> list[str]:
+    return [double(float(c)) for i, row in enumerate(matrix) for c in row[i:]]

@@ -1,0 +1,107 @@
+"""The ellipsoids that grow fastest backward in time: the value function optimized with the funnel.
+
+With L' = L W, W symmetric and constant on an interval, |y| falls on the boundary if
+
+    y'W y > y'L^-1 (f(x* + L y, u) - x*') =: g(t, y)   for all |y| = 1,
+
+and the volume grows backward at the rate -tr W. So W solves a linear program: minimize tr W + evenness max y'W y such
+that the inequality holds at sampled t and y with a spare rate, and the limits on the states are kept; g is taken along
+the ellipsoids of the previous W, a fixed point in a few rounds. The TVLQR's shape is one feasible choice at every
+instant; here the shape is free (Tobenkin, Manchester, Tedrake 2011, alternate between multipliers and V to that end).
+"""
+
+import itertools
+
+import numpy as np
+from scipy.linalg import expm
+from scipy.optimize import linprog
+
+from rtcd_jax.certificate.loop import Loop
+
+EVENNESS = (0.1, 0.3, 1.0)
+"""Weights of the fastest shrinking direction beside the volume, to choose from: none is best for all elites."""
+ROUNDS = 6
+TIMES = 5
+"""Instants of an interval at which the inequality is asked for."""
+FASTEST = 100.0
+"""Largest |entry of W| [1/s]."""
+SETTLING = 0.02
+"""Time [s] in which an ellipsoid may use up what is left to a limit on the states."""
+SHARE_OF_LIMIT = 0.99
+WIDEST = 2.0
+"""Largest half width [rad] along the angle: beyond it polynomials follow the sine badly."""
+LONGEST = 0.05
+"""Longest interval [s] of predictions: one W for a longer one is too coarse."""
+PREDICTED_SPARE = 0.02
+"""Spare rate [1/s] of predictions."""
+KEPT_INLET = 0.5
+"""Share of the TVLQR's inlet that an optimized funnel must keep to be preferred."""
+
+
+def fastest_growth(
+    loop: Loop, k: int, start: float, end: float, axes: np.ndarray, spare: float, evenness: float, y: np.ndarray
+) -> np.ndarray | None:
+    """W [n n] for the interval that ends with the ellipsoid `axes`; None if there is none."""
+    pairs = [(i, j) for i in range(loop.n) for j in range(i + 1)]
+    cost = np.array([*(float(i == j) for i, j in pairs), evenness])
+    products = _products(y, pairs)
+    below = np.column_stack([-products, np.ones(len(products))])  # the last unknown is max y'W y
+    w = path = np.zeros((loop.n, loop.n))
+    for _ in range(ROUNDS):
+        path = (path + w) / 2  # without the average the rounds alternate about their limit
+        rows, levels = [], []
+        for share in np.linspace(start, end, TIMES):
+            here = axes @ expm(-path * (end - share) * loop.dt)
+            rows.append(products)
+            levels.append(loop.drift(k, share, here, y) + spare)
+            narrow, least = _limits(loop, k, share, here, pairs)
+            rows.append(narrow)
+            levels.append(least)
+        table = np.concatenate(rows)
+        table = np.concatenate([np.column_stack([table, np.zeros(len(table))]), below])
+        found = linprog(cost, -table, -np.concatenate([*levels, np.zeros(len(below))]), bounds=(-FASTEST, FASTEST))
+        if found.status != 0:
+            return None
+        w = np.zeros((loop.n, loop.n))
+        for (i, j), value in zip(pairs, found.x[:-1], strict=True):
+            w[i, j] = w[j, i] = value
+    return w
+
+
+def _products(y: np.ndarray, pairs: list[tuple[int, int]]) -> np.ndarray:
+    """Coefficients [D, pairs] of y'W y in the entries of W."""
+    return np.stack([y[i] * y[j] * (1 if i == j else 2) for i, j in pairs], axis=1)
+
+
+def _limits(loop: Loop, k: int, share: float, axes: np.ndarray, pairs: list) -> tuple[np.ndarray, np.ndarray]:
+    """Rows and least values: half widths |row of L| grow backward no faster than what is left to their limits."""
+    rooms = SHARE_OF_LIMIT * loop.rooms(k, share)
+    rooms[loop.plant.angle] = min(rooms[loop.plant.angle], WIDEST)
+    bounded = np.isfinite(rooms)
+    widths = np.linalg.norm(axes, axis=1)[bounded]
+    return _products((axes[bounded] / widths[:, None]).T, pairs), -np.log(rooms[bounded] / widths) / SETTLING
+
+
+def predicted(loop: Loop, axes: np.ndarray, evenness: float, y: np.ndarray) -> np.ndarray | None:
+    """Volumes [N+1], knots first, up to the unit ball's, if every interval goes through; None if it cannot."""
+    volumes = [np.linalg.det(axes)]
+    shares = np.linspace(1, 0, int(np.ceil(loop.dt / LONGEST)) + 1)
+    for k in range(len(loop.u) - 1, -1, -1):
+        for end, start in itertools.pairwise(shares):
+            w = fastest_growth(loop, k, start, end, axes, PREDICTED_SPARE, evenness, y)
+            if w is None:
+                return None
+            axes = axes @ expm(-w * (end - start) * loop.dt)
+        volumes.append(np.linalg.det(axes))
+    return np.array(volumes[::-1])
+
+
+def best_evenness(loop: Loop, axes: np.ndarray, rhos: np.ndarray, y: np.ndarray) -> float | None:
+    """The evenness with the largest sum of volumes that about keeps the inlet of the levels `rhos`; None: keep S."""
+    usual = rhos ** (loop.n / 2) / np.sqrt(np.linalg.det(loop.values))
+    best, most = None, float(usual.sum())
+    for evenness in EVENNESS:
+        volumes = predicted(loop, axes, evenness, y)
+        if volumes is not None and volumes.sum() > most and volumes[0] >= KEPT_INLET * usual[0]:
+            best, most = evenness, float(volumes.sum())
+    return best

@@ -1,0 +1,32 @@
+"""One small run folder with a proved elite, for all tests of certificates."""
+
+import json
+
+import pytest
+
+from rtcd_jax.certificate.elite import certify_elite
+from rtcd_jax.storage import write_elite
+from tests.certificate import swing
+
+
+@pytest.fixture(scope="session")
+def run(tmp_path_factory):
+    """A run folder whose elite 000 is certified."""
+    folder = tmp_path_factory.mktemp("run")
+    for place in ("elites", "certificates"):
+        (folder / place).mkdir()
+    write_elite(folder / "elites", "000", *swing.elite())
+    certify_elite(folder, "000", "proved", lambda step: None)
+    return folder
+
+
+@pytest.fixture(scope="session")
+def text(run):
+    """The certificate's file."""
+    return (run / "certificates" / "000.json").read_text()
+
+
+@pytest.fixture
+def content(text):
+    """The certificate, to be changed at will."""
+    return json.loads(text)

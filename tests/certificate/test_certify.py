@@ -1,0 +1,211 @@
+"""From a run folder to certificates: stored step by step, resumed after a kill, told in a table."""
+
+import json
+
+import numpy as np
+import pytest
+from scipy.linalg import expm
+
+from rtcd_jax import cli
+from rtcd_jax.certificate import check, descent, elite, flow
+from rtcd_jax.certificate.loop import Loop, claim_of, double, sealed
+from rtcd_jax.certificate.run import certify_run, rank_correlation
+from rtcd_jax.errors import UserError
+from rtcd_jax.storage import write_elite
+from tests.certificate import swing
+
+
+class Console:
+    def __init__(self):
+        self.lines, self.steps = [], []
+
+    def message(self, text):
+        self.lines.append(text)
+
+    def progress(self, now):
+        self.steps.append(now)
+
+
+def folder_of(path, **changed):
+    arrays, record = swing.elite()
+    for place in ("elites", "certificates"):
+        (path / place).mkdir(parents=True)
+    write_elite(path / "elites", "000", {**arrays, **changed}, record)
+    return path
+
+
+def claimed(arrays, record):
+    told = {**claim_of(arrays, record), "start": [0, double(0.0)]}
+    return check.read_claim(check.Node("claim", sealed(told)))
+
+
+def test_the_claim_is_the_elite_bit_by_bit(content):
+    arrays, record = swing.elite()
+    claim = check.read_claim(check.Node("claim", content["claim"]))
+    for name, value in (("x", claim.x), ("u", claim.u), ("K", claim.K), ("x_goal", claim.x_goal)):
+        stored = arrays[name].reshape(np.shape(value))
+        assert [float(c) for c in np.ravel(value)] == stored.ravel().tolist()
+    assert float(claim.dt) == swing.DT
+    assert {key: float(v) for key, v in claim.parameters.items()} == swing.PARAMETERS
+    assert [float(b) for b in claim.bounds] == record["state_limits"]
+    rates = np.array([[[float(c) for c in end] for end in pair] for pair in claim.rates])
+    for k, u in enumerate(arrays["u"][:, 0]):
+        np.testing.assert_allclose(rates[k], [swing.rate(arrays["x"][k + end], u) for end in (0, 1)], rtol=1e-13)
+
+
+def test_its_shape_is_the_riccati_equation_s():
+    """Between knots S follows the equation that the elite's S solves, and L its rate."""
+    arrays, record = swing.elite()
+    loop = Loop(claimed(arrays, record), arrays)
+    finer, _ = swing.elite(tuple(np.repeat([1.2, 1.0, 0.7, 0.4], 1)))
+    np.testing.assert_allclose(loop.value(1, 0.0)[0], finer["S"][1])
+    step = 1e-5
+    for share in (0.2, 0.7):
+        slope = (loop.value(2, share + step)[0] - loop.value(2, share - step)[0]) / (2 * step * swing.DT)
+        np.testing.assert_allclose(loop.value(2, share)[1], slope, rtol=1e-5, atol=1e-5)
+        axes, rates = loop.axes(2, share, 3.0, 0.7)
+        np.testing.assert_allclose(axes @ axes.T, 3 * np.linalg.inv(loop.value(2, share)[0]), rtol=1e-12)
+        ahead = loop.axes(2, share + step, 3.0 * np.exp(0.7 * step * swing.DT), 0.7)[0]
+        np.testing.assert_allclose(rates, (ahead - axes) / (step * swing.DT), rtol=1e-2, atol=1e-2)
+        assert axes[0, 1] == 0
+
+
+def test_levels_are_as_large_as_the_loop_allows(content):
+    """The proved funnel gives away little: its outlet touches the limit on the speed, or V would rise on it."""
+    axes = np.array([[float.fromhex(c) for c in row] for row in content["goal"]["axes"]])
+    assert 6.9 < np.linalg.norm(axes[1]) <= 7
+    spared = [each.spare for each in steps_of(swing.elite())]
+    assert max(spared) <= 0.04
+
+
+def steps_of(stored):
+    arrays, record = stored
+    claim = claimed(arrays, record)
+    search = descent.Descent(claim, Loop(claim, arrays), exact=False)
+    return list(search.down_from(search.outlet(15.0)))
+
+
+def test_a_gain_of_the_wrong_sign_cannot_be_proved(tmp_path):
+    arrays, _ = swing.elite()
+    run = folder_of(tmp_path, K_goal=-arrays["K_goal"])
+    assert elite.certify_elite(run, "000", "proved", lambda step: None) is None
+
+
+def test_a_funnel_that_ends_before_the_start_is_told(tmp_path):
+    """Pushed away from the nominal in the first interval, as if u* were another: the later part is proved still."""
+    arrays, _ = swing.elite()
+    u = arrays["u"].copy()
+    u[0] -= 40.0
+    run = folder_of(tmp_path, u=u)
+    console = Console()
+    assert not certify_run(run, 1, "proved", 1, console)
+    report = check.check_file(run / "certificates" / "000.json")
+    assert 0 < report.start <= swing.DT
+    assert "0.05" in console.lines[0]
+
+
+@pytest.mark.parametrize("rung", elite.RUNGS)
+def test_a_run_is_certified_in_processes_of_its_own(tmp_path, rung):
+    run, console = folder_of(tmp_path), Console()
+    assert certify_run(run, 1, rung, 2, console)
+    summary = json.loads((run / "certificates" / "summary.json").read_text())["000"]
+    report = check.check_file(run / "certificates" / "000.json")
+    assert summary["rung"] == rung
+    assert summary["found"] == report.volumes
+    assert f"sampled / {rung}" in console.lines[0]
+    assert console.steps[-1].generation == console.steps[-1].generations
+    assert "back to t = 0.000 s" in str(console.steps[-1])
+    assert not list((run / "certificates").glob(".*"))
+
+
+class Killed(Exception):
+    pass
+
+
+def test_a_killed_search_goes_on_to_the_same_certificate(run, tmp_path):
+    killed = folder_of(tmp_path)
+
+    def stop(step):
+        if step.knot == 2:
+            raise Killed
+
+    with pytest.raises(Killed):
+        elite.certify_elite(killed, "000", "proved", stop)
+    journal = killed / "certificates" / ".000.partial.jsonl"
+    with journal.open("ab") as file:
+        file.write(b'{"stretch": {"torn')
+    seen = []
+    elite.certify_elite(killed, "000", "proved", lambda step: seen.append(step.knot))
+    assert seen == [1, 0]
+    assert (killed / "certificates" / "000.json").read_bytes() == (run / "certificates" / "000.json").read_bytes()
+
+
+def test_another_elite_s_journal_is_not_used(tmp_path):
+    run = folder_of(tmp_path)
+    journal = run / "certificates" / ".000.partial.jsonl"
+    journal.write_text('{"claim": "another", "rung": "proved"}\n{"goal": {}, "outlet": 1.0}\n')
+    assert elite.certify_elite(run, "000", "proved", lambda step: None) is not None
+
+
+def test_what_cannot_be_claimed_is_refused():
+    arrays, record = swing.elite()
+    with pytest.raises(UserError, match="the checker knows pendulum, cartpole"):
+        claim_of(arrays, {**record, "plant": "acrobot"})
+    with pytest.raises(UserError, match=r"u_max = 9\.0: must be torque_limit = 2\.5"):
+        claim_of({**arrays, "u_max": np.array([9.0])}, record)
+    with pytest.raises(UserError, match="no certificate for 2 inputs"):
+        claim_of({**arrays, "u": np.zeros((4, 2))}, record)
+
+
+def test_the_command_line(run, tmp_path, capsys):
+    assert cli.main(["certify", str(run)]) == 0
+    assert cli.main(["check", str(run / "certificates" / "000.json")]) == 0
+    assert "PROVED" in capsys.readouterr().out
+    assert cli.main(["certify", str(tmp_path)]) == 2
+    assert cli.main(["certify", str(run), "--elites", "0"]) == 2
+    errors = capsys.readouterr().err
+    assert "has no elites yet" in errors
+    assert "--elites = 0: must be >= 1" in errors
+
+
+def test_ranks_of_sampled_and_proved_sums():
+    def outcome(sampled, found):
+        return elite.Outcome("000", "proved", 0.0, 1, 1.0, {"sum": sampled}, {"sum": found})
+
+    alike = [outcome(1.0, 10.0), outcome(2.0, 20.0), outcome(3.0, 25.0)]
+    turned = [outcome(1.0, 30.0), outcome(2.0, 20.0), outcome(3.0, 10.0)]
+    assert rank_correlation(alike) == pytest.approx(1)
+    assert rank_correlation(turned) == pytest.approx(-1)
+
+
+@pytest.mark.slow
+def test_ellipsoids_of_free_shape_are_larger(tmp_path):
+    """Where S is not TVLQR's but a poor one, freeing the shape gives more than the proof with that S."""
+    arrays, _ = swing.elite()
+    slim = np.array([[4.0, 0.0], [0.0, 0.5]])
+    values = arrays["S"].copy()
+    values[:-1] = slim @ values[:-1] @ slim
+    rho = np.full(5, 4.0)
+    sums = []
+    for freed in (False, True):
+        run = folder_of(tmp_path / str(freed), S=values, rho=rho)
+        outcome = elite.certify_elite(run, "000", "proved", lambda step: None, optimize_value=freed)
+        sums.append(outcome.found["sum"])
+        assert check.check_file(run / "certificates" / "000.json").volumes == outcome.found
+    assert sums[1] > 1.2 * sums[0]
+
+
+def test_free_shapes_obey_the_sampled_inequality():
+    """y'W y >= g on the sphere, and the trace is the least: the Riccati equation's own W has a larger one."""
+    arrays, record = swing.elite()
+    claim = claimed(arrays, record)
+    loop, aims = Loop(claim, arrays), descent.directions(2)[:, ::4]
+    axes, _ = loop.axes(2, 1.0, 3.0, 0.0)
+    w = flow.fastest_growth(loop, 2, 0.0, 1.0, axes, 0.1, 0.0, aims)
+    for share in (0.0, 0.5, 1.0):
+        here = axes @ expm(-w * (1 - share) * loop.dt)
+        growth = np.sum(aims * (w @ aims), axis=0) - loop.drift(2, share, here, aims)
+        assert growth.min() > 0.05
+    usual = loop.growth(2, 1.0, 3.0, aims)
+    _, rates = loop.axes(2, 1.0, 3.0, usual)
+    assert np.trace(w) < np.trace(np.linalg.solve(axes, rates)) + 2 * 0.1

@@ -1,0 +1,168 @@
+"""Known theorems on both sides of their thresholds, shown by the program and accepted by the checker's arithmetic."""
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+from rtcd_jax.certificate import check, program
+from rtcd_jax.certificate.check import Obligation, Q, Refused, Witness, polynomial
+
+NOTHING = Q(0)
+
+
+def exact(value):
+    return Q(*float(value).as_integer_ratio())
+
+
+def anywhere(p, low=0.0, high=1.0):
+    return Obligation(p, NOTHING, NOTHING, [], exact(low), exact(high))
+
+
+def shown(todo, degree, bernstein=0, multiplier=0):
+    """The margin that the checker accepts, or None."""
+    shape = program.shape_of(todo, degree, bernstein, multiplier)
+    found = program.solve(program.data_of(todo, shape), shape)
+    return None if found is None else float(check.margin(todo, found.witness, "theorem"))
+
+
+def cubic(level):
+    """x' = -x + x^3 on {x^2 <= level}: with x = sqrt(level) l z, -d/dt x^2 / (level l^2) = 2 - 2 level l^2 z^4."""
+    return anywhere(polynomial(1, {(0, 2): Q(2), (2, 4): exact(-2 * level)}))
+
+
+def test_cubic_field_has_the_unit_interval():
+    assert shown(cubic(0.99), 1, 2) == pytest.approx(0.02, rel=1e-5)
+    assert shown(cubic(1.01), 1, 2) is None
+
+
+def motzkin():
+    """x^4 y^2 + x^2 y^4 - 3 x^2 y^2 z^2 + z^6 >= 0 is no sum of squares; times x^2 + y^2 + z^2 it is one."""
+    powers = {(0, 4, 2, 0): Q(1), (0, 2, 4, 0): Q(1), (0, 2, 2, 2): Q(-3), (0, 0, 0, 6): Q(1)}
+    return anywhere(polynomial(3, powers))
+
+
+def test_motzkin_is_refused_until_it_is_multiplied():
+    cvxpy = [program.CvxpyProgram(program.shape_of(motzkin(), degree, 0, 0)).margin(motzkin()) for degree in (3, 4)]
+    assert cvxpy[0] < -1e-3
+    assert cvxpy[1] == pytest.approx(0, abs=1e-5)
+    assert shown(motzkin(), 3) is None
+
+
+def lifted(amount):
+    p = motzkin().p + polynomial(3, {(0, 0, 0, 0): exact(amount)})
+    return anywhere(p)
+
+
+def test_motzkin_lifted_by_what_it_lacks():
+    lack = -program.CvxpyProgram(program.shape_of(motzkin(), 3, 0, 0)).margin(motzkin())
+    assert shown(lifted(1.01 * lack), 3) > 0
+    assert shown(lifted(0.99 * lack), 3) is None
+
+
+VALUE = np.array([[1.5, -0.5], [-0.5, 1.0]])  # A'P + P A = -I for the field's linearization at the origin
+
+
+def van_der_pol(x):
+    """Reversed in time: the inside of the limit cycle is the region of attraction."""
+    return np.stack([-x[1], x[0] + (x[0] ** 2 - 1) * x[1]])
+
+
+def van_der_pol_level(level):
+    """-V'/l^2 on V = level l^2, by substituting x = l L z into the polynomial field."""
+    axes = np.linalg.cholesky(np.linalg.inv(VALUE) * level)
+    space = check.Space(2, 16, 16)
+    x = [sum_of(space, axes[i]) for i in range(2)]
+    level_squared = polynomial(2, {(2, 0, 0): Q(1)})
+    field = [x[1] * Q(-1), x[0] - x[1] + x[0] * x[0] * x[1] * level_squared]
+    p = polynomial(2, {})
+    for i in range(2):
+        for j in range(2):
+            p = p + x[i] * field[j] * exact(-2 * VALUE[i, j])
+    return anywhere(p)
+
+
+def sum_of(space, row):
+    p = polynomial(2, {})
+    for i, c in enumerate(row):
+        p = p + space.y(i) * exact(c)
+    return p
+
+
+def largest_falling_level():
+    """The largest level below which V falls everywhere, by samples."""
+    angle = np.linspace(0, 2 * np.pi, 4001)
+    z = np.linalg.cholesky(np.linalg.inv(VALUE)) @ np.stack([np.cos(angle), np.sin(angle)])
+    levels = np.linspace(0.5, 4, 7001)
+    rises = [np.max(np.sum((VALUE @ z) * van_der_pol(np.sqrt(level) * z), axis=0)) >= 0 for level in levels]
+    return levels[np.argmax(rises)]
+
+
+def test_van_der_pol_reversed():
+    level = largest_falling_level()
+    assert shown(van_der_pol_level(0.998 * level), 3, 4) > 0
+    assert shown(van_der_pol_level(1.002 * level), 3, 4) is None
+
+
+def test_van_der_pol_s_ellipse_lies_inside_the_limit_cycle():
+    cycle = solve_ivp(lambda _, x: -van_der_pol(x), (0, 100), [2.0, 0.0], rtol=1e-9, atol=1e-9, max_step=0.01).y
+    values = np.sum(cycle[:, 2000:] * (VALUE @ cycle[:, 2000:]), axis=0)
+    assert largest_falling_level() < values.min()
+
+
+def ellipse_in_a_case(threshold):
+    """y_1 + 0.5 >= 0 wherever y_1 >= threshold, with a time-dependent threshold: needs a multiplier."""
+    p = polynomial(2, {(0, 1, 0): Q(1), (0, 0, 0): exact(0.5)})
+    g = polynomial(2, {(0, 1, 0): Q(1), (0, 0, 0): exact(-threshold), (1, 0, 0): exact(0.01)})
+    return Obligation(p, NOTHING, NOTHING, [g], exact(-1), exact(1))
+
+
+def test_conditions_hold_by_multipliers_and_cvxpy_agrees_with_clarabel():
+    for threshold, sign in ((-0.4, 1), (-0.6, -1)):
+        todo = ellipse_in_a_case(threshold)
+        shape = program.shape_of(todo, 2, 3, 1)
+        expected = 0.5 + threshold - 0.01
+        assert program.CvxpyProgram(shape).margin(todo) == pytest.approx(expected, abs=1e-5)
+        margin = shown(todo, 2, 3, 1)
+        assert (margin == pytest.approx(expected, abs=1e-5)) if sign > 0 else (margin is None)
+
+
+def test_a_program_is_compiled_once():
+    shape = program.shape_of(cubic(0.5), 1, 2, 0)
+    compiled = program.CvxpyProgram(shape)
+    for level in (0.3, 0.9, 1.2):
+        assert compiled.margin(cubic(level)) == pytest.approx(2 - 2 * level, abs=1e-5)
+
+
+def test_an_error_is_taken_from_the_margin():
+    todo = cubic(0.5)
+    shape = program.shape_of(todo, 1, 2, 0)
+    found = program.solve(program.data_of(todo, shape), shape)
+    assert float(check.margin(todo, found.witness, "x")) == pytest.approx(1, abs=1e-5)
+    assert float(check.margin(todo._replace(error=exact(0.25)), found.witness, "x")) == pytest.approx(0.75, abs=1e-5)
+    with pytest.raises(Refused, match=r"x\.gram\[\d\]: proves no decrease: at best -0\.5"):
+        check.margin(todo._replace(error=exact(1.5)), found.witness, "x")
+
+
+def test_indefinite_matrices_are_refused():
+    todo = cubic(0.5)
+    shape = program.shape_of(todo, 1, 2, 0)
+    found = program.solve(program.data_of(todo, shape), shape).witness
+    gram = [[row[:] for row in matrix] for matrix in found.gram]
+    gram[1][0][0] = Q(-1, 1 << 60)
+    with pytest.raises(Refused, match=r"x\.gram\[1\]: is not positive definite"):
+        check.margin(todo, Witness(found.degree, gram, []), "x")
+    with pytest.raises(Refused, match="needs 0 multipliers"):
+        check.margin(todo, found._replace(multipliers=[[]]), "x")
+    with pytest.raises(Refused, match="order 2 in time needs more than 2 Bernstein polynomials"):
+        check.margin(todo, found._replace(gram=found.gram[:2]), "x")
+
+
+def test_samples_bound_the_margin():
+    """No program's margin exceeds the least sampled value, and here the sphere has but two points."""
+    todo, z = cubic(0.75), np.array([[-1.0, 1.0]])
+    shape = program.shape_of(todo, 1, 2, 0)
+    assert program.lowest(program.data_of(todo, shape), shape, z) == pytest.approx(0.5)
+    todo = ellipse_in_a_case(-0.6)
+    shape, angle = program.shape_of(todo, 2, 3, 1), np.linspace(0, 2 * np.pi, 10000)
+    circle = np.stack([np.cos(angle), np.sin(angle)])
+    assert program.lowest(program.data_of(todo, shape), shape, circle) == pytest.approx(-0.11, abs=1e-3)
