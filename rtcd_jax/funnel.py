@@ -83,9 +83,11 @@ def _scan_knots(problem, candidate, sets: Ellipsoids, tracked, boxes, last, key,
             ladder = jnp.minimum(radius * window ** np.linspace(-1, 1, RADII), box)
             radii = jnp.broadcast_to(ladder, (directions.shape[1], RADII))
             reached, peaks = step.ends(radii, directions[..., None], effort.dynamics.directions)
-            bad = jnp.maximum(jnp.sum(reached**2, 0) / target, peaks**2)
-            bad = jnp.where(jnp.isnan(bad), jnp.inf, bad)
-            return jnp.min(_crossings(radii, bad)), bad[:, -1]
+            # Each for itself: between V and a peak that is near one all the way nothing can be interpolated.
+            shares = jnp.sum(reached**2, 0) / target, peaks**2
+            value, peak = (jnp.where(jnp.isnan(share), jnp.inf, share) for share in shares)
+            crossings = jnp.minimum(_crossings(radii, value), _crossings(radii, peak))
+            return jnp.min(crossings), jnp.maximum(value, peak)[:, -1]
 
         radius, bad = jax.lax.scan(look, jnp.sqrt(target), jnp.asarray(WINDOWS, dtype))
         level = (1 - MARGIN) * radius**2

@@ -73,7 +73,8 @@ def solve(problem: Subproblem, floor: float = 1e-12) -> Step:
     arrays, numbers = eqx.partition((problem.hessian, problem.gradient, problem.jacobian, defects), eqx.is_array)
 
     def eliminate_input(value: _Value, stage):
-        before, policy = _eliminate_input(value, *eqx.combine(stage, numbers), floor)
+        hessian, gradient, jacobian, defect = eqx.combine(stage, numbers)
+        before, policy = _eliminate_input(value, hessian, gradient, jacobian, defect, floor)
         return before, (policy, [*value.linear[:n]], _square(value.quadratic)[:n], [row[:n] for row in value.end])
 
     first, (policy, slopes, rows, ends) = jax.lax.scan(eliminate_input, last, arrays, reverse=True)
@@ -144,7 +145,7 @@ def _solve_definite(lower: Matrix, right: Matrix, floor):
         rows.append(
             [plus(b, *(times(-1.0, times(factor[i][k], rows[k][c])) for k in range(i))) for c, b in enumerate(right[i])]
         )
-    solution = [None] * m
+    solution: list[list] = [[] for _ in range(m)]
     for i in reversed(range(m)):
         inverse = 1 / pivots[i]
         solution[i] = [
