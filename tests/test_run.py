@@ -32,8 +32,7 @@ SMALL = yaml.safe_load(configuration.EXAMPLE) | {
     "trajectory": {"knots": 16, "step": {"min": 0.05, "max": 0.25}, "substeps": 3},
     "funnel": {
         "rollouts": "closed_form",
-        "directions": 16,
-        "radii": 6,
+        "directions": 8,
         "steps": 6,
         "trials": 16,
         "goal": {"directions": 16, "radii": 6, "horizon": 1.0, "step": 0.02},
