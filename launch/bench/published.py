@@ -23,8 +23,8 @@ CANDIDATES = {  # the design variables, then the diagonals of Q and R (paper, ta
         "paper RTC-D": (0.6078624798988952, 0.40117256711300914, 9.981383224646017, 1.0005008747137005, 3.38679890836),
     },
     "cartpole": {
-        "initial": (0.1778, 0.227, 10.0, 10.0, 10.0),
-        "paper RTC": (0.1778, 0.227, 10.9115773954839, 12.574189978778616, 6.091846874535788),
+        "initial": (0.1778, 0.227, 10.0, 10.0, 1.0, 1.0, 10.0),
+        "paper RTC": (0.1778, 0.227, 10.9115773954839, 12.574189978778616, 1.0, 1.0, 6.091846874535788),
     },
 }
 VOLUMES = {"sum": "total", "integral": "integral", "inlet": "inlet", "geometric mean": "geometric_mean"}
