@@ -69,9 +69,10 @@ def stabilize(problem: Problem, candidate: Candidate, trajectory: Trajectory) ->
     motion = nominal(problem, candidate, trajectory)
     middles = (np.arange(substeps) + 0.5) / substeps
     xs = motion.at(middles)
-    weights = input_weights(problem, candidate, motion.inputs)
+    inputs = jnp.concatenate([motion.inputs, jnp.zeros_like(motion.inputs[:, :1])], 1)
+    weights = input_weights(problem, candidate, inputs)
     us = jnp.broadcast_to(motion.inputs[:, :, None], (problem.plant.m, *xs.shape[1:]))
-    pieces = _interval(problem, candidate, xs, us, weights[..., None], trajectory.dt / substeps)
+    pieces = _interval(problem, candidate, xs, us, weights[:, :-1, None], trajectory.dt / substeps)
     whole = jax.tree.map(lambda leaf: leaf[..., 0], pieces)
     for piece in range(1, substeps):
         whole = riccati.compose(whole, jax.tree.map(lambda leaf, piece=piece: leaf[..., piece], pieces))
@@ -86,9 +87,7 @@ def stabilize(problem: Problem, candidate: Candidate, trajectory: Trajectory) ->
     stages = jax.tree.map(lambda leaf: jnp.moveaxis(leaf, -1, 0), whole)
     (_, definite), values = jax.lax.scan(backward, (last, reached), stages, reverse=True)
     values = jnp.concatenate([values, last[None]])
-    inputs = jnp.concatenate([motion.inputs, jnp.zeros_like(motion.inputs[:, :1])], 1)
     _, b = linearize(problem, candidate, trajectory.xs.T, inputs)
-    weights = input_weights(problem, candidate, inputs)
     gains = mm(transpose(b) / weights[:, None], jnp.moveaxis(values, 0, -1))
     status = jnp.where(definite, Status.OK, Status.RICCATI_INDEFINITE)
     return Policy(trajectory, jnp.moveaxis(gains, -1, 0), values, first_failure(trajectory.status, status))

@@ -20,6 +20,7 @@ import json
 import os
 import socket
 import time
+import zipfile
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, Self, TypeVar, final
@@ -174,14 +175,28 @@ def write_elite(folder: Path, name: str, arrays: Arrays, record: Record) -> None
 
 
 def read_elite(folder: Path, name: str) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-    """The arrays and the record of `folder`/NAME. Raises UserError, with the names that are there, if it is not."""
+    """The arrays and the record of `folder`/NAME.
+
+    Raises:
+        UserError: it is not there (the error has the names that are), or one of its files is damaged.
+    """
     paths = [folder / f"{name}.{suffix}" for suffix in ("npz", "json")]
     if not all(path.is_file() for path in paths):
         there = ", ".join(sorted(path.stem for path in folder.glob("*.npz"))) or "nothing"
         raise UserError(f"{folder} has no {name}.npz with its {name}.json; there is {there}")
-    with np.load(paths[0], allow_pickle=False) as file:
-        arrays = dict(file)
-    return arrays, json.loads(paths[1].read_text(encoding="utf-8"))
+    with _reading(paths[0]), paths[0].open("rb") as file, np.load(file, allow_pickle=False) as stored:
+        arrays = dict(stored)
+    with _reading(paths[1]):
+        return arrays, json.loads(paths[1].read_text(encoding="utf-8"))
+
+
+@contextlib.contextmanager
+def _reading(path: Path) -> Iterator[None]:
+    """Turns what a damaged file raises into one error that names it."""
+    try:
+        yield
+    except (OSError, EOFError, ValueError, zipfile.BadZipFile) as error:
+        raise UserError(f"cannot read {path}: {error}; restore it, or make the run again") from error
 
 
 def elite_names(path: Path) -> list[str]:

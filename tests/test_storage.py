@@ -426,6 +426,16 @@ def test_a_missing_elite_is_refused_with_those_that_are_there(tmp_path):
         storage.read_elite(tmp_path, "007")
 
 
+@pytest.mark.parametrize("suffix", ["npz", "json"])
+@pytest.mark.parametrize("kept", [0, 40])
+def test_a_damaged_elite_is_refused_by_its_file(tmp_path, suffix, kept):
+    storage.write_elite(tmp_path, "000", {"rho": np.arange(9.0)}, {"text": "a" * 50})
+    damaged = tmp_path / f"000.{suffix}"
+    damaged.write_bytes(damaged.read_bytes()[:kept])
+    with pytest.raises(UserError, match=rf"cannot read .*000\.{suffix}: .*restore it"):
+        storage.read_elite(tmp_path, "000")
+
+
 def test_reading_a_run_imports_neither_jax_nor_orbax():
     code = "import sys, rtcd_jax.storage; print({'jax', 'orbax'} & set(sys.modules))"
     done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)

@@ -56,6 +56,16 @@ def timed(call: Callable[[], Any]) -> tuple[Any, Timed]:
     return value, Timed(time.perf_counter() - wall, time.process_time() - cpu)
 
 
+def prepare_jax() -> None:
+    """Double precision and XLA's options as the command line sets them, on one device; before jax is used."""
+    from rtcd_jax.cli import CPU_FLAGS
+
+    os.environ.setdefault("XLA_FLAGS", " ".join(CPU_FLAGS))
+    import jax
+
+    jax.config.update("jax_enable_x64", True)
+
+
 def peak_memory() -> int:
     """Largest resident size of this process so far [bytes]."""
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
@@ -79,12 +89,9 @@ def measure_pipeline(config: Path, population: int, repeats: int) -> Measured:
 
     Genomes are uniform in the unit box of the search. `with_funnel` is the share of candidates whose status is OK.
     """
-    from rtcd_jax.cli import CPU_FLAGS
-
-    os.environ.setdefault("XLA_FLAGS", " ".join(CPU_FLAGS))  # as the command line sets it
+    prepare_jax()
     import jax
 
-    jax.config.update("jax_enable_x64", True)
     from rtcd_jax.config import load
     from rtcd_jax.evaluation import make_evaluate
     from rtcd_jax.problem import make_problem

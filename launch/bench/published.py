@@ -7,13 +7,11 @@ initial one's, and the largest knot's share of the sum: what the best of a run h
 """
 
 import argparse
-import os
 from pathlib import Path
 
 import jax
 import jax.numpy as jnp
-
-from rtcd_jax.cli import CPU_FLAGS
+from measure import prepare_jax
 
 CONFIGS = Path(__file__).parents[2] / "configs"
 CANDIDATES = {  # the design variables, then the diagonals of Q and R (paper, table I and the authors' results)
@@ -34,8 +32,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("robot", nargs="?", choices=CANDIDATES, default="pendulum")
     robot = parser.parse_args().robot
-    os.environ.setdefault("XLA_FLAGS", " ".join(CPU_FLAGS))  # as the command line sets it
-    jax.config.update("jax_enable_x64", True)
+    prepare_jax()
     from rtcd_jax.config import load
     from rtcd_jax.evaluation import elite_effort, make_evaluate
     from rtcd_jax.population import encode

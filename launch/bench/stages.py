@@ -6,14 +6,13 @@ Stages are compiled and timed one by one, each on the results of the one before;
 """
 
 import argparse
-import os
 import tempfile
 from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
 
 import numpy as np
-from measure import CONFIG, RESULTS, environment, save, timed
+from measure import CONFIG, RESULTS, environment, prepare_jax, save, timed
 
 REPEATS = 3
 
@@ -47,23 +46,22 @@ def stages(config, population: int) -> Iterator[tuple[str, float, float]]:
     def chunked(function: Callable):
         return lambda *arguments: jax.lax.map(lambda row: function(*row), arguments, batch_size=chunk)
 
-    def sets(policy):
-        return Ellipsoids.about(policy.trajectory.xs.T, jnp.moveaxis(policy.values, 0, -1))
+    def prepared(candidate, policy):
+        sets = Ellipsoids.about(policy.trajectory.xs.T, jnp.moveaxis(policy.values, 0, -1))
+        tracked = rollout.reference(problem, candidate, policy, effort.funnel.steps)
+        return sets, sets.radii_inside(jnp.asarray(problem.state_limits)), tracked
 
     def goal(candidate, policy):
-        all_sets = sets(policy)
-        box = all_sets.radii_inside(jnp.asarray(problem.state_limits))[-1]
-        return funnel._goal_level(problem, candidate, policy, all_sets.part(slice(-1, None)), box, key, effort)
+        sets, boxes, _ = prepared(candidate, policy)
+        return funnel._goal_level(problem, candidate, policy, sets.part(slice(-1, None)), boxes[-1], key, effort)
 
     def scan(candidate, policy, last):
-        all_sets = sets(policy)
-        boxes = all_sets.radii_inside(jnp.asarray(problem.state_limits))
-        tracked = rollout.reference(problem, candidate, policy, effort.funnel.steps)
-        return funnel._scan_knots(problem, candidate, all_sets, tracked, boxes, last, key, effort)
+        sets, boxes, tracked = prepared(candidate, policy)
+        return funnel._scan_knots(problem, candidate, sets, tracked, boxes, last, key, effort)
 
     def fresh(candidate, policy, levels):
-        tracked = rollout.reference(problem, candidate, policy, effort.funnel.steps)
-        return confirm(problem, candidate, sets(policy), tracked, levels, key, effort)
+        sets, _, tracked = prepared(candidate, policy)
+        return confirm(problem, candidate, sets, tracked, levels, key, effort)
 
     genomes = jax.random.uniform(key, (population, len(problem.free)))
     candidates = jax.vmap(partial(decode, problem))(genomes)
@@ -102,12 +100,7 @@ def main() -> None:
     parser.add_argument("--population", type=int, default=128)
     parser.add_argument("--results", type=Path, default=RESULTS, help="folder of the JSON file")
     arguments = parser.parse_args()
-    from rtcd_jax.cli import CPU_FLAGS
-
-    os.environ.setdefault("XLA_FLAGS", " ".join(CPU_FLAGS))  # as the command line sets it
-    import jax
-
-    jax.config.update("jax_enable_x64", True)
+    prepare_jax()
     from rtcd_jax.config import load
 
     rows = []

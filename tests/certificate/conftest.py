@@ -5,17 +5,14 @@ import json
 import pytest
 
 from rtcd_jax.certificate.elite import certify_elite
-from rtcd_jax.storage import write_elite
 from tests.certificate import swing
+from tests.certificate.folder import folder_with
 
 
 @pytest.fixture(scope="session")
 def run(tmp_path_factory):
     """A run folder whose elite 000 is certified."""
-    folder = tmp_path_factory.mktemp("run")
-    for place in ("elites", "certificates"):
-        (folder / place).mkdir()
-    write_elite(folder / "elites", "000", *swing.elite())
+    folder = folder_with(tmp_path_factory.mktemp("run"), *swing.elite())
     certify_elite(folder, "000", "proved", lambda step: None)
     return folder
 

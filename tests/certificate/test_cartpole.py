@@ -7,18 +7,15 @@ import pytest
 
 from rtcd_jax.certificate import check
 from rtcd_jax.certificate.elite import certify_elite
-from rtcd_jax.storage import write_elite
 from tests.certificate import balance
+from tests.certificate.folder import folder_with
 from tests.certificate.loops import Simulated, floats
 from tests.certificate.test_check import ROUNDING, nudged, refusal, resealed
 
 
 @pytest.fixture(scope="module")
 def proved(tmp_path_factory):
-    run = tmp_path_factory.mktemp("cartpole")
-    for place in ("elites", "certificates"):
-        (run / place).mkdir()
-    write_elite(run / "elites", "000", *balance.elite())
+    run = folder_with(tmp_path_factory.mktemp("cartpole"), *balance.elite())
     outcome = certify_elite(run, "000", "proved", lambda step: None)
     assert outcome is not None
     assert outcome.whole

@@ -11,8 +11,8 @@ from rtcd_jax.certificate import check, descent, elite, flow
 from rtcd_jax.certificate.loop import Loop, claim_of, double, sealed
 from rtcd_jax.certificate.run import certify_run, rank_correlation
 from rtcd_jax.errors import UserError
-from rtcd_jax.storage import write_elite
 from tests.certificate import swing
+from tests.certificate.folder import folder_with
 
 
 class Console:
@@ -28,10 +28,7 @@ class Console:
 
 def folder_of(path, **changed):
     arrays, record = swing.elite()
-    for place in ("elites", "certificates"):
-        (path / place).mkdir(parents=True)
-    write_elite(path / "elites", "000", {**arrays, **changed}, record)
-    return path
+    return folder_with(path, {**arrays, **changed}, record)
 
 
 def claimed(arrays, record):
