@@ -30,7 +30,7 @@ def optimize(arguments: Sequence[str]) -> int:
 
     config, options = read_optimize(arguments, RUNS)
     _prepare_jax(options.cpu_devices)
-    from rtcd_jax.cluster import Cluster, Preempted, join
+    from rtcd_jax.cluster import Cluster, Lost, Preempted, join, part
 
     join(options.coordinator, options.num_processes, options.process_id)  # before any import that touches a device
     from rtcd_jax.console import Console, silent
@@ -43,15 +43,21 @@ def optimize(arguments: Sequence[str]) -> int:
             run_optimize(config, options.run, console, cluster)
         except Preempted:
             console.message(f"asked to stop (SIGTERM): saved in {options.run}; the same command goes on")
+            part()
             _leave(PREEMPTED)
+        except Lost as error:
+            print(f"rtcd: {error}; start all of them again by the same command, to go on", file=sys.stderr)
+            _leave(LOST_PROCESS)
+        except UserError as error:
+            if cluster.processes == 1:
+                raise
+            print(f"rtcd: {error}", file=sys.stderr)
+            _leave(WRONG_INPUT)
     return OK
 
 
 def _leave(code: int) -> NoReturn:
-    """Ends this process without waiting for what its devices still compute or compile."""
-    from rtcd_jax.cluster import part
-
-    part()
+    """Ends this process without waiting for what its devices still compute, or for other processes."""
     sys.stdout.flush()
     sys.stderr.flush()
     os._exit(code)

@@ -8,7 +8,6 @@ from collections.abc import Callable
 from functools import partial
 
 import jax
-import jax.numpy as jnp
 
 from rtcd_jax import rollout
 from rtcd_jax.confirmation import Dynamics, Effort
