@@ -44,7 +44,7 @@ def draw_levels(run: Run) -> list[Path]:
         volumes.set(xlabel="time [s]", ylabel=f"volume [{volume_unit(run.config)}]")
         for axes in (levels, volumes):
             axes.grid(axis="y", lw=0.4, color=LIGHT)
-        levels.legend(title=rung(run.best.record))
+        figure.legend(handles=levels.lines, title=rung(run.best.record), ncols=2, loc="outside upper center")
         return written(figure, run.path / "figures", "levels")
 
 
@@ -72,10 +72,16 @@ def draw_shadows(axes: "Axes", funnels: Sequence[Shown], plane: tuple[int, int])
     """Funnels in their own colors over one another, the one that reaches farthest lowest."""
     from matplotlib.collections import PolyCollection
     from matplotlib.colors import to_rgba
+    from matplotlib.patches import PathPatch
+    from matplotlib.path import Path as Curve
 
     for funnel in sorted(funnels, key=lambda funnel: -float(funnel.per_knot.max())):
-        face, edge = to_rgba(funnel.color, 0.06), to_rgba(funnel.color, 0.5)
-        axes.add_collection(PolyCollection(list(shadow(funnel, plane)), facecolors=face, edgecolors=edge, lw=0.5))
+        curves = list(shadow(funnel, plane))
+        # One curve of all ellipses is filled once: their shades do not add up where they overlap.
+        whole = Curve.make_compound_path(*map(Curve, curves))
+        axes.add_patch(PathPatch(whole, facecolor=to_rgba(funnel.color, 0.15), lw=0))
+        edges = to_rgba(funnel.color, 0.45)
+        axes.add_collection(PolyCollection(curves, facecolors="none", edgecolors=edges, lw=0.5))
         axes.plot(*funnel.x[:, plane].T, color=funnel.color, label=funnel.label, zorder=3)
 
 
