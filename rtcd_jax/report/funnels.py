@@ -59,7 +59,7 @@ def draw_over(runs: Sequence[Run], folder: Path, name: str) -> list[Path]:
         for axes, plane in zip(panels, pairs, strict=True):
             draw_shadows(axes, funnels, plane)
             frame(axes, config, plane, window(funnels, plane))
-        figure.legend(**_told_once(panels), loc="outside upper center")
+        figure.legend(**told_once(panels), loc="outside upper center")
         for funnel in funnels:
             volumes.semilogy(funnel.time, funnel.per_knot, color=funnel.color, label=_told(config, funnel))
         volumes.set(xlabel="time [s]", ylabel=f"volume of a knot's\nellipsoid [{volume_unit(config)}]")
@@ -127,14 +127,14 @@ def _beside(figure: "Figure", run: Run) -> None:
                 axes.set_title(_title(config, funnel))
             panels.append(axes)
     figure.colorbar(colors, ax=panels, label="time [s]", pad=0.02, aspect=30 * len(pairs))
-    figure.legend(**_told_once(panels), loc="outside upper center", title=run.absence or None)
+    figure.legend(**told_once(panels), loc="outside upper center", title=run.absence or None)
     volumes = figure.add_subplot(grid[-1, :])
     _draw_volumes(volumes, config, funnels)
     # The figure's legend, not the panel's: its width must not squeeze the panels.
     figure.legend(handles=volumes.lines, loc="outside lower center")
 
 
-def _told_once(panels: Sequence["Axes"]) -> dict[str, Any]:
+def told_once(panels: Sequence["Axes"]) -> dict[str, Any]:
     """The entries of a legend, in one row, for all that the panels have in common."""
     found = [zip(*axes.get_legend_handles_labels(), strict=True) for axes in panels]
     handles = {label: handle for pairs in found for handle, label in pairs}

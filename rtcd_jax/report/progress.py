@@ -79,7 +79,7 @@ def _convergence(figure: "Figure", config: Config, generations: Generations) -> 
     volumes.set_ylabel(f"volume ({words(search.objective)}) [{volume_unit(config, search.objective)}]")
     volumes.legend(title="sampled, as the search saw it", title_fontsize=SMALL)
     sigma.set(ylabel="step size\n[box widths]", xlabel="generation")
-    sigma.xaxis.get_major_locator().set_params(integer=True)
+    _whole_numbers(sigma)
 
 
 def _draw_statuses(axes: "Axes", index: np.ndarray, generations: Generations) -> None:
@@ -107,7 +107,13 @@ def _draw_course(axes: "Axes", course: Course, index: np.ndarray) -> None:
     if course.logarithmic:
         logarithmic(axes)
     axes.set(ylim=course.window, title=course.title)
-    axes.xaxis.get_major_locator().set_params(integer=True)
+    _whole_numbers(axes)
+
+
+def _whole_numbers(axes: "Axes") -> None:
+    from matplotlib.ticker import MaxNLocator
+
+    axes.xaxis.set_major_locator(MaxNLocator(integer=True))
 
 
 def _wide(axes: "Axes") -> None:

@@ -132,8 +132,8 @@ def _gains_of(run: Run) -> Iterator[tuple[Cell, ...]]:
         label = f"{words(name)} (searched)" if name == searched else words(name)
         times = ratio(after, before) if before is not None else None
         yield label, volume_unit(run.config, name), before, after, times, told_time(run), run.best.record["rung"]
-    found = run.certificates.get("000")
-    for name in order if found else ():
+    found = run.certificates.get("000") or {"found": {}}
+    for name in order:
         if name in found["found"]:
             unit, took = volume_unit(run.config, name), duration(found["seconds"])
             yield words(name), unit, None, found["found"][name], None, took, found["rung"]
