@@ -77,6 +77,11 @@ class Console:
         self._bar.update(self._bar.task_ids[0], completed=now.generation, description=str(now), refresh=True)
 
 
+def silent() -> Console:
+    """One that says nothing: for processes beside the first."""
+    return Console(terminal=Terminal(quiet=True))
+
+
 def _volume(value: float) -> str:
     return "none" if math.isnan(value) else f"{value:.5g}"
 

@@ -13,6 +13,7 @@ from rtcd_jax.config import EXAMPLE, UNIT, Config, Variable, load, parse, parse_
 from rtcd_jax.errors import UserError
 from rtcd_jax.settings import Settings, bounds
 
+_COORDINATOR = "where process 0 listens; srun and mpirun need none"
 OPTIMIZE_USAGE = "rtcd optimize CONFIG [--run FOLDER] [--KEY VALUE …]"
 
 
@@ -34,6 +35,11 @@ class OptimizeOptions:
     config: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="CONFIG", help="the experiment, a YAML file")]
     settings: Annotated[Branch, tyro.conf.arg(name="")]
     run: Annotated[Path, tyro.conf.arg(metavar="FOLDER", help="run folder, resumed if it is there")]
+    devices: Annotated[int | None, tyro.conf.arg(help="devices to use of those each process sees [-] (all)")] = None
+    cpu_devices: Annotated[int | None, tyro.conf.arg(help="parts the CPU is split into [-] (its cores)")] = None
+    coordinator: Annotated[str | None, tyro.conf.arg(metavar="HOST:PORT", help=_COORDINATOR)] = None
+    num_processes: Annotated[int | None, tyro.conf.arg(help="processes of this run [-] (known under srun)")] = None
+    process_id: Annotated[int | None, tyro.conf.arg(help="this one's number [-] (0 …, known under srun)")] = None
 
 
 @dataclass(frozen=True)
@@ -99,8 +105,8 @@ class CertifyOptions:
     workers: Annotated[int, tyro.conf.arg(help="processes, one elite each [-] (>= 1)")] = 2
 
 
-def read_optimize(arguments: Sequence[str], runs: Path) -> tuple[Config, Path]:
-    """The configuration with its overrides, and the run folder.
+def read_optimize(arguments: Sequence[str], runs: Path) -> tuple[Config, OptimizeOptions]:
+    """The configuration with its overrides, and the options beside it.
 
     Raises `UserError` for a wrong YAML or value; tyro itself exits with code 2 for an unknown option.
     """
@@ -112,7 +118,22 @@ def read_optimize(arguments: Sequence[str], runs: Path) -> tuple[Config, Path]:
     else:
         raise UserError(f"the configuration comes first, but found {arguments[0]!r}: {OPTIMIZE_USAGE}")
     options = _parse(arguments, OptimizeOptions(config=tyro.MISSING, settings=_config_branch(defaults), run=folder))
-    return parse(options.settings, f"{options.config} with the options given"), options.run
+    _require_processes(options)
+    return parse(options.settings, f"{options.config} with the options given"), options
+
+
+def _require_processes(options: OptimizeOptions) -> None:
+    """All of coordinator, number and id, or none of them."""
+    for name, smallest in (("devices", 1), ("cpu_devices", 1), ("num_processes", 1), ("process_id", 0)):
+        value = getattr(options, name)
+        if value is not None and value < smallest:
+            raise UserError(f"--{name} = {value}: must be >= {smallest}")
+    together = {name: getattr(options, name) for name in ("coordinator", "num_processes", "process_id")}
+    missing = [f"--{name}" for name, value in together.items() if value is None]
+    if 0 < len(missing) < len(together):
+        raise UserError(f"{', '.join(missing)}: must be given too; a process needs all of --{', --'.join(together)}")
+    if options.process_id is not None and options.process_id >= options.num_processes:
+        raise UserError(f"--process_id = {options.process_id}: must be < --num_processes = {options.num_processes}")
 
 
 def read_verify(arguments: Sequence[str]) -> VerifyOptions:
