@@ -108,6 +108,13 @@ WRONG = {
     "no run": (["verify", "no/such/run"], "no/such/run: no such run folder"),
     "no states": (["verify", "configs", "--states", "0"], "--states = 0: must be >= 1"),
     "negative seed": (["verify", "configs", "--seed", "-1"], "--seed = -1: must be >= 0"),
+    "no run to report": (["report"], "which run? rtcd report RUN [RUN …] [--to FILE]"),
+    "no such run to report": (["report", "configs", "no/such/run"], "no/such/run: no such run folder"),
+    "no such run to animate": (["animate", "no/such/run"], "no/such/run: no such run folder"),
+    "negative seed to animate": (["animate", "configs", "--seed", "-1"], "--seed = -1: must be >= 0"),
+    "no such run to replay": (["replay", "no/such/run", "x.csv"], "no/such/run: no such run folder"),
+    "nothing to replay": (["replay", "configs"], "FILE"),
+    "negative elite to replay": (["replay", "configs", "x.csv", "--elite", "-1"], "--elite = -1: must be >= 0"),
     "misspelt verify option": (["verify", "configs", "--sed", "1"], "--seed"),
 }
 
@@ -214,6 +221,33 @@ def test_verify_exits_by_the_promise(monkeypatch, tmp_path, held, code):
     monkeypatch.setattr(cli, "_prepare_jax", lambda *_: None)
     assert cli.main(["verify", str(tmp_path), "--states", "10", "--seed", "3"]) == code
     assert calls == [(tmp_path, 10, 3)]
+
+
+@pytest.mark.parametrize(("kept", "code"), [(True, 0), (False, 1)])
+def test_replay_exits_by_the_funnel(monkeypatch, tmp_path, kept, code):
+    calls = []
+    module = types.ModuleType("rtcd_jax.report.replay")
+    module.replay_run = lambda folder, file, elite, console: calls.append((folder, file, elite)) or kept
+    monkeypatch.setitem(sys.modules, "rtcd_jax.report.replay", module)
+    assert cli.main(["replay", str(tmp_path), "lab.csv", "--elite", "2"]) == code
+    assert calls == [(tmp_path, Path("lab.csv"), 2)]
+
+
+@pytest.mark.parametrize(
+    ("verb", "arguments"), [("report", ["."]), ("animate", ["."]), ("replay", [".", "measured.csv"])]
+)
+def test_what_is_no_run_folder_is_told_in_one_line(verb, arguments, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(cli, "_prepare_jax", lambda: None)
+    monkeypatch.chdir(tmp_path)
+    assert cli.main([verb, *arguments]) == 2
+    assert capsys.readouterr().err == "rtcd: . is no run folder: it has no format.json\n"
+
+
+@pytest.mark.parametrize("verb", ["report", "animate", "replay"])
+def test_help_has_an_example(verb):
+    code, output, _ = rtcd(verb, "--help")
+    assert code == 0
+    assert f"Example: rtcd {verb} checkpoints/" in flat(output)
 
 
 PREPARED = """

@@ -41,6 +41,8 @@ OWNERS = {
     "tyro": {"options"},
     "yaml": {"config"},
     "matplotlib": {"report"},
+    "PIL": {"report"},
+    "imageio_ffmpeg": {"report"},
     "pydantic": {"settings", "config", "options"},
     "pydantic_core": {"settings"},
 }

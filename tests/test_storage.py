@@ -252,6 +252,16 @@ def test_the_folder_tells_its_configuration_and_every_start(tmp_path):
         assert first["commit"].removesuffix("+") == head.stdout.strip()
 
 
+def test_every_start_tells_how_long_it_worked(tmp_path):
+    with RunFolder.open(tmp_path / "run", experiment()) as folder:
+        time.sleep(0.11)
+        folder.tell_time()
+    RunFolder.open(tmp_path / "run", experiment()).close()
+    first, second = json.loads((tmp_path / "run" / "provenance.json").read_text())["starts"]
+    assert 0.1 <= first["seconds"] < 60
+    assert "seconds" not in second
+
+
 def refused(path, config=None):
     with pytest.raises(UserError) as error:
         RunFolder.open(path, config or experiment())
