@@ -10,7 +10,7 @@ from collections.abc import Iterator, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol, final
+from typing import Any, final
 
 from rich.box import SIMPLE
 from rich.console import Console as Terminal
@@ -18,6 +18,7 @@ from rich.table import Table
 from scipy.stats import spearmanr
 
 from rtcd_jax.certificate.elite import Outcome, Step, certify_elite
+from rtcd_jax.console import Console
 from rtcd_jax.errors import UserError
 from rtcd_jax.files import replace_json, writing
 from rtcd_jax.storage import elite_names
@@ -28,23 +29,18 @@ RANKED = 3
 """Elites from which on a rank correlation says something."""
 
 
-class Console(Protocol):
-    def message(self, text: str, /) -> None: ...
-    def progress(self, now: Any, /) -> None: ...
-
-
 @final
 @dataclass(frozen=True)
 class Progress:
-    """All elites' certificates together; `generation` of `generations` thousandths are done."""
+    """All elites' certificates together, `done` of `total` thousandths of them."""
 
-    generation: int
-    generations: int
+    done: int
+    total: int
     step: Step
     elapsed: float
 
     def __str__(self) -> str:
-        step, share = self.step, self.generation / self.generations
+        step, share = self.step, self.done / self.total
         left = self.elapsed * (1 - share) / share if share else float("nan")
         return (
             f"elite {step.elite}  interval {step.knot + 1}/{step.knots}  back to t = {step.time:.3f} s"
