@@ -70,11 +70,25 @@ def check(arguments: Sequence[str]) -> int:
     return check_main(arguments)
 
 
+def falsify(arguments: Sequence[str]) -> int:
+    """simulate a great many motions of what a certificate says is proved"""
+    from rtcd_jax.options import read_falsify
+
+    options = read_falsify(arguments)
+    from rtcd_jax.certificate.falsify import falsify_file
+    from rtcd_jax.console import Console
+
+    with Console() as console:
+        held = falsify_file(options.certificate, options.rollouts, options.seed, options.workers, console)
+    return OK if held else BROKEN_PROMISE
+
+
 VERBS: dict[str, Callable[[Sequence[str]], int]] = {
     "optimize": optimize,
     "verify": verify,
     "certify": certify,
     "check": check,
+    "falsify": falsify,
 }
 
 

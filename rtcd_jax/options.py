@@ -1,7 +1,7 @@
 """Command line → checked options, by tyro. Overrides are merged into the YAML's mapping and validated as one."""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal, cast
 
@@ -60,6 +60,24 @@ class CertifyOptions:
     workers: Annotated[int, tyro.conf.arg(help="processes, one elite each [-] (>= 1)")] = 2
 
 
+@dataclass(frozen=True)
+class FalsifyOptions:
+    """Simulate motions from the boundary and the inside of what a certificate says is proved, at instants all over it.
+
+    Equations and integrator share nothing with the proof. Exit code 1 if a motion leaves the funnel, a limit or the
+    goal region, beyond the integrator's own error, which is measured.
+
+    example: rtcd falsify checkpoints/pendulum_rtcd/certificates/000.json --rollouts 100000
+    """
+
+    certificate: Annotated[
+        tyro.conf.Positional[Path], tyro.conf.arg(metavar="FILE", help="a certificate, or a run folder (its 000)")
+    ]
+    rollouts: Annotated[int, tyro.conf.arg(help="motions to simulate [-] (>= 1)")] = 1_000_000
+    seed: Annotated[int, tyro.conf.arg(help="of their starts [-] (>= 0)")] = 0
+    workers: Annotated[int, tyro.conf.arg(help="processes [-] (>= 1)")] = 2
+
+
 def read_optimize(arguments: Sequence[str], runs: Path) -> tuple[Config, Path]:
     """The configuration with its overrides, and the run folder.
 
@@ -96,6 +114,17 @@ def read_certify(arguments: Sequence[str]) -> CertifyOptions:
             raise UserError(f"--{name} = {getattr(options, name)}: must be >= 1")
     if not options.run.is_dir():
         raise UserError(f"{options.run}: no such run folder; `{OPTIMIZE_USAGE}` makes one")
+    return options
+
+
+def read_falsify(arguments: Sequence[str]) -> FalsifyOptions:
+    """The checked options of `rtcd falsify`; `UserError` if one is out of range."""
+    options = tyro.cli(FalsifyOptions, args=arguments, prog="rtcd falsify", use_underscores=True)
+    for name, least in (("rollouts", 1), ("seed", 0), ("workers", 1)):
+        if getattr(options, name) < least:
+            raise UserError(f"--{name} = {getattr(options, name)}: must be >= {least}")
+    if options.certificate.is_dir():
+        return replace(options, certificate=options.certificate / "certificates" / "000.json")
     return options
 
 

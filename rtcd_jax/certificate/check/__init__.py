@@ -47,7 +47,7 @@ does not rest on them.
 from rtcd_jax.certificate.check.claim import PLANTS, Claim, Plant
 from rtcd_jax.certificate.check.command import main
 from rtcd_jax.certificate.check.exact import PI, PI_ERROR, Q, Refused, alternating, near, root_up, up
-from rtcd_jax.certificate.check.file import Node, read_claim, read_stretch, seal
+from rtcd_jax.certificate.check.file import Node, parse, read_claim, read_stretch, seal
 from rtcd_jax.certificate.check.funnel import Motion, Stretch, funnel_obligations, insist_bounds, motion
 from rtcd_jax.certificate.check.goal import Shell, goal_field, goal_obligations
 from rtcd_jax.certificate.check.scalar import cofactors
@@ -100,6 +100,7 @@ __all__ = [
     "monomials",
     "motion",
     "near",
+    "parse",
     "peak",
     "polynomial",
     "read_claim",
