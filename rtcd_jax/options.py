@@ -13,6 +13,7 @@ from rtcd_jax.config import EXAMPLE, UNIT, Config, Variable, load, parse, parse_
 from rtcd_jax.errors import UserError
 from rtcd_jax.settings import Settings, bounds
 
+POLICY_UNITS = {"authority": "-", "discount": "1/s"}
 OPTIMIZE_USAGE = "rtcd optimize CONFIG [--run FOLDER] [--KEY VALUE …]"
 
 
@@ -152,7 +153,12 @@ def _config_branch(config: Config) -> Branch:
     design = {name: _section(variable, plant.design[name]) for name, variable in config.design.items()}
     weights = {"q": _list(config.weights.q, plant.states), "r": _list(config.weights.r, plant.inputs)}
     task = _section(config.task, ", ".join(plant.states.values()))
-    return _section(config, branches={"task": task, "design": _group(design), "weights": _group(weights)})
+    searched = config.policy.variables()
+    policy = _section(
+        config.policy, branches={name: _section(option, POLICY_UNITS[name]) for name, option in searched.items()}
+    )
+    branches = {"task": task, "design": _group(design), "weights": _group(weights), "policy": policy}
+    return _section(config, branches=branches)
 
 
 def _list(weights: Sequence[Variable], units: Mapping[str, str]) -> Branch:
@@ -174,7 +180,8 @@ def _section(settings: Settings, unit: str = "", branches: Mapping[str, Branch] 
         if name in ready or isinstance(value, Settings):
             fields.append(StructFieldSpec(name, Branch, ready.get(name) or _section(value, unit), field.description))
         else:
-            fields.append(StructFieldSpec(name, cast(type, field.annotation), value, _help(field, unit)))
+            kind = float if isinstance(value, float) else cast(type, field.annotation)
+            fields.append(StructFieldSpec(name, kind, value, _help(field, unit)))
     return Branch(tuple(fields))
 
 
