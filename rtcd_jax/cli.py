@@ -83,12 +83,29 @@ def falsify(arguments: Sequence[str]) -> int:
     return OK if held else BROKEN_PROMISE
 
 
+def audit(arguments: Sequence[str]) -> int:
+    """show where a funnel from outside fails, and mend its nominal for a proof"""
+    from rtcd_jax.options import read_audit
+
+    options = read_audit(arguments)
+    from rtcd_jax.certificate.audit import audit as run_audit
+    from rtcd_jax.certificate.outside import Cost, read_outside
+    from rtcd_jax.console import Console
+
+    given = read_outside(options.file, options.plant, options.numbers)
+    cost = Cost.of(given, options.q, options.r, options.state_limits)
+    with Console() as console:
+        held = run_audit(given, cost, options.states, options.seed, options.out, console)
+    return OK if held else BROKEN_PROMISE
+
+
 VERBS: dict[str, Callable[[Sequence[str]], int]] = {
     "optimize": optimize,
     "verify": verify,
     "certify": certify,
     "check": check,
     "falsify": falsify,
+    "audit": audit,
 }
 
 

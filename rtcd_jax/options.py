@@ -79,6 +79,40 @@ class FalsifyOptions:
     workers: Annotated[int, tyro.conf.arg(help="processes [-] (>= 1)")] = 2
 
 
+@dataclass(frozen=True)
+class AuditOptions:
+    """Simulate a funnel from outside, knot by knot, and mend its nominal motion so that one can be proved about it.
+
+    FILE is a table: after a row of headings one row a knot, with the time, the states, the input held until the next
+    knot, rho, and the upper triangle of S. The gains are R^-1 B'S. Exit code 1 if a state left the funnel.
+
+    example: rtcd audit funnel.csv --plant pendulum --parameters m=0.7 l=0.4 b=0.1 g=9.81 torque_limit=2.5
+    --q 10 1 --r 0.1 --out checkpoints/audit
+    """
+
+    file: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="FILE", help="the trajectory and its funnel")]
+    plant: Annotated[str, tyro.conf.arg(help="pendulum or cartpole")]
+    parameters: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME=VALUE …", help="its physical numbers [SI]")]
+    q: Annotated[tuple[float, ...], tyro.conf.arg(help="diagonal of the cost's Q [1/(s state's unit^2)]")]
+    r: Annotated[float, tyro.conf.arg(help="the cost's R [1/(s input's unit^2)]")]
+    out: Annotated[Path, tyro.conf.arg(metavar="FOLDER", help="where the audit and the elites are stored")]
+    state_limits: Annotated[tuple[float, ...], tyro.conf.arg(help="largest |x_i|, inf for none [state's unit]")] = ()
+    states: Annotated[int, tyro.conf.arg(help="fresh states of each ellipsoid [-] (>= 1)")] = 1000
+    seed: Annotated[int, tyro.conf.arg(help="of the states [-] (>= 0)")] = 0
+
+    @property
+    def numbers(self) -> dict[str, float]:
+        """The parameters by name; `UserError` for one that is not NAME=VALUE."""
+        found = {}
+        for text in self.parameters:
+            name, _, value = text.partition("=")
+            try:
+                found[name] = float(value)
+            except ValueError:
+                raise UserError(f"--parameters {text}: must be NAME=VALUE with a number") from None
+        return found
+
+
 def read_optimize(arguments: Sequence[str], runs: Path) -> tuple[Config, Path]:
     """The configuration with its overrides, and the run folder.
 
@@ -115,6 +149,15 @@ def read_certify(arguments: Sequence[str]) -> CertifyOptions:
             raise UserError(f"--{name} = {getattr(options, name)}: must be >= 1")
     if not options.run.is_dir():
         raise UserError(f"{options.run}: no such run folder; `{OPTIMIZE_USAGE}` makes one")
+    return options
+
+
+def read_audit(arguments: Sequence[str]) -> AuditOptions:
+    """The checked options of `rtcd audit`; `UserError` if one is out of range."""
+    options = tyro.cli(AuditOptions, args=arguments, prog="rtcd audit", use_underscores=True)
+    for name, least in (("states", 1), ("seed", 0)):
+        if getattr(options, name) < least:
+            raise UserError(f"--{name} = {getattr(options, name)}: must be >= {least}")
     return options
 
 

@@ -24,7 +24,7 @@ ARRIVED = 0.1
 """|y| in the goal region at which a motion is followed no further: the proof holds all the way down."""
 LONGEST = 60.0
 """Time [s] after which a motion has not arrived."""
-TOGETHER = 1.0
+TOGETHER = 0.2
 """Time [s] between two looks for motions that have arrived."""
 
 Input = Callable[[float, np.ndarray], np.ndarray]

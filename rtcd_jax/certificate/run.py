@@ -75,7 +75,8 @@ def certify_run(
             outcomes[event[0]] = event[1]
     replace_json(target / "summary.json", {name: _summary(outcomes[name]) for name in names})
     finished = [outcome for name in names if (outcome := outcomes[name]) is not None]
-    console.message(_table(finished, rung))
+    beside = "/".join(dict.fromkeys(outcome.beside for outcome in finished)) or "sampled"
+    console.message(_table(finished, f"volumes: {beside} / {rung}"))
     if len(finished) >= RANKED:
         correlation = rank_correlation(finished)
         console.message(f"rank correlation of sampled and {rung} sums over {len(finished)} elites: {correlation:.3f}")
@@ -130,8 +131,8 @@ def _summary(outcome: Outcome | None) -> dict[str, Any] | None:
     return None if outcome is None else outcome._asdict()
 
 
-def _table(outcomes: Sequence[Outcome], rung: str) -> str:
-    table = Table(box=SIMPLE, title=f"volumes: sampled / {rung}")
+def _table(outcomes: Sequence[Outcome], title: str) -> str:
+    table = Table(box=SIMPLE, title=title)
     table.add_column("elite")
     for heading in ("from, s", "intervals", "took, s", "inlet", "sum", "ratio of sums", "integral", "goal"):
         table.add_column(heading, justify="right")
