@@ -136,6 +136,35 @@ def check(arguments: Sequence[str]) -> int:
     return check_main(arguments)
 
 
+def falsify(arguments: Sequence[str]) -> int:
+    """simulate a great many motions of what a certificate says is proved"""
+    from rtcd_jax.options import read_falsify
+
+    options = read_falsify(arguments)
+    from rtcd_jax.certificate.falsify import falsify_file
+    from rtcd_jax.console import Console
+
+    with Console() as console:
+        held = falsify_file(options.certificate, options.rollouts, options.seed, options.workers, console)
+    return OK if held else BROKEN_PROMISE
+
+
+def audit(arguments: Sequence[str]) -> int:
+    """show where a funnel from outside fails, and mend its nominal for a proof"""
+    from rtcd_jax.options import read_audit
+
+    options = read_audit(arguments)
+    from rtcd_jax.certificate.audit import audit as run_audit
+    from rtcd_jax.certificate.outside import Cost, read_outside
+    from rtcd_jax.console import Console
+
+    given = read_outside(options.file, options.plant, options.numbers)
+    cost = Cost.of(given, options.q, options.r, options.state_limits)
+    with Console() as console:
+        held = run_audit(given, cost, options.states, options.seed, options.out, console)
+    return OK if held else BROKEN_PROMISE
+
+
 VERBS: dict[str, Callable[[Sequence[str]], int]] = {
     "optimize": optimize,
     "verify": verify,
@@ -144,6 +173,8 @@ VERBS: dict[str, Callable[[Sequence[str]], int]] = {
     "replay": replay,
     "certify": certify,
     "check": check,
+    "falsify": falsify,
+    "audit": audit,
 }
 
 
