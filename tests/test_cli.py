@@ -95,7 +95,7 @@ def test_help_shows_the_file_s_own_values(tmp_path):
 
 
 WRONG = {
-    "misspelt verb": (["optimise"], "unknown command 'optimise'; did you mean 'optimize'? Valid: optimize, verify"),
+    "misspelt verb": (["optimise"], "unknown command 'optimise'; did you mean 'optimize'? Valid: optimize, sweep"),
     "no file": (["optimize", "configs/pendulum_rtcdd.yaml"], "no such file; did you mean 'configs/pendulum_rtcd.yaml'"),
     "no arguments": (["optimize"], "Missing from rtcd optimize: CONFIG"),
     "option first": (["optimize", "--run", "x", RTCD], "the configuration comes first, but found '--run'"),
