@@ -9,7 +9,7 @@ import tyro
 from pydantic.fields import FieldInfo
 from tyro.constructors import ConstructorRegistry, StructConstructorSpec, StructFieldSpec, StructTypeInfo
 
-from rtcd_jax.config import EXAMPLE, UNIT, Config, Variable, load, parse, parse_yaml
+from rtcd_jax.config import EXAMPLE, SMALLEST_POPULATION, UNIT, Config, Variable, load, parse, parse_yaml
 from rtcd_jax.errors import UserError
 from rtcd_jax.settings import Settings, bounds
 from rtcd_jax.sweep import Case, read_cases
@@ -81,6 +81,29 @@ class SweepOptions:
     case: Annotated[int | None, tyro.conf.arg(help="number of the only one to run [-] (0 …)")] = None
     list: Annotated[bool, tyro.conf.arg(help="show the cases and what is known of them, run nothing")] = False
     machines: Annotated[Machines, tyro.conf.arg(name="")] = Machines()
+
+
+@dataclass(frozen=True)
+class ScaleOptions:
+    """Measure whole generations against the population and the devices; writes a table and figures.
+
+    Every point runs in a process of its own, on a CPU with a core for each device; what is measured already is kept.
+
+    Example: rtcd scale configs/pendulum_rtcd.yaml --populations 64,256,1024 --devices 1,2
+    """
+
+    config: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="CONFIG", help="the experiment, a YAML file")]
+    populations: Annotated[str, tyro.conf.arg(metavar="P,P,…", help="candidates in a generation [-]")] = "64,256,1024"
+    devices: Annotated[str, tyro.conf.arg(metavar="D,D,…", help="devices to share them out over [-]")] = "1,2"
+    repeats: Annotated[int, tyro.conf.arg(help="timed generations of each point [-] (>= 1)")] = 5
+    folder: Annotated[Path | None, tyro.conf.arg(help="of points, table and figures (checkpoints/scale_NAME)")] = None
+
+    def counts(self, name: str) -> tuple[int, ...]:
+        """The numbers of a list; `UserError` for one that is no number."""
+        try:
+            return tuple(int(word) for word in getattr(self, name).split(","))
+        except ValueError:
+            raise UserError(f"--{name} = {getattr(self, name)}: must be whole numbers, split by commas") from None
 
 
 @dataclass(frozen=True)
@@ -228,6 +251,17 @@ def read_sweep(arguments: Sequence[str], runs: Path) -> tuple[list[Case], SweepO
     if options.case is not None and not 0 <= options.case < len(cases):
         raise UserError(f"--case = {options.case}: must be one of 0 … {len(cases) - 1}")
     return cases, options
+
+
+def read_scale(arguments: Sequence[str], runs: Path) -> tuple[Config, ScaleOptions]:
+    """The configuration and the options; `UserError` for a wrong YAML or number."""
+    options = tyro.cli(ScaleOptions, args=arguments, prog="rtcd scale", use_underscores=True)
+    if options.repeats < 1:
+        raise UserError(f"--repeats = {options.repeats}: must be >= 1")
+    for name, least in (("populations", SMALLEST_POPULATION), ("devices", 1)):
+        if min(options.counts(name)) < least:
+            raise UserError(f"--{name} = {getattr(options, name)}: all must be >= {least}")
+    return load(options.config), replace(options, folder=options.folder or runs / f"scale_{options.config.stem}")
 
 
 def read_verify(arguments: Sequence[str]) -> VerifyOptions:
