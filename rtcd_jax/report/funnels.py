@@ -30,7 +30,7 @@ def draw_funnels(run: Run) -> list[Path]:
     """
     with blank((WIDTH, 2.9 * len(planes(run.best.x.shape[1])) + 3.1)) as figure:
         _beside(figure, run)
-        return written(figure, run.path / "figures", "funnel")
+        return written(figure, run.figures, "funnel")
 
 
 def draw_levels(run: Run) -> list[Path]:
@@ -45,7 +45,7 @@ def draw_levels(run: Run) -> list[Path]:
         for axes in (levels, volumes):
             axes.grid(axis="y", lw=0.4, color=LIGHT)
         figure.legend(handles=levels.lines, title=rung(run.best.record), ncols=2, loc="outside upper center")
-        return written(figure, run.path / "figures", "levels")
+        return written(figure, run.figures, "levels")
 
 
 def draw_over(runs: Sequence[Run], folder: Path, name: str) -> list[Path]:

@@ -5,6 +5,7 @@ a click on a heading.
 """
 
 import base64
+import dataclasses
 import html
 import json
 from collections.abc import Iterator, Mapping, Sequence
@@ -34,7 +35,8 @@ def report(folders: Sequence[Path], to: Path | None = None) -> list[Path]:
     """Writes the page of a finished run, or one that compares several, and its figures; the page's path first.
 
     One run: `report.html` and `figures/` in its folder. Several: `comparison.html` beside the first folder, with
-    `comparison.png` and `.pdf`. `to` is another path for the page.
+    `comparison.png` and `.pdf`. `to`, say NAME.html, is another path for the page; then one run's figures are in
+    NAME_figures/ beside it, and the run's folder is only read.
 
     Raises:
         UserError: a folder that is no finished run's, runs of different robots, or a path that cannot be written.
@@ -43,7 +45,8 @@ def report(folders: Sequence[Path], to: Path | None = None) -> list[Path]:
     if to is not None and to.is_dir():
         raise UserError(f"--to = {to}: must be a file, and this is a folder")
     if len(runs) == 1:
-        page, drawn = to or folders[0] / "report.html", draw_figures(runs[0])
+        (run,), page = runs, to or folders[0] / "report.html"
+        drawn = draw_figures(dataclasses.replace(run, figures=to.with_name(f"{to.stem}_figures")) if to else run)
     else:
         runs = compared(runs)
         page = to or folders[0].resolve().parent / "comparison.html"
@@ -53,7 +56,7 @@ def report(folders: Sequence[Path], to: Path | None = None) -> list[Path]:
 
 
 def draw_figures(run: Run) -> list[Path]:
-    """The figures of one run as `figures/NAME.png` and `.pdf`. Raises UserError if they cannot be written."""
+    """The figures of one run, NAME.png and .pdf in `run.figures`. Raises UserError if they cannot be written."""
     return [path for draw in (draw_funnels, draw_levels, draw_courses, draw_convergence) for path in draw(run)]
 
 

@@ -64,9 +64,13 @@ class Experiment:
 @final
 @dataclass(frozen=True)
 class Run:
-    """A run folder. `initial` is None where the initial candidate has no funnel, and `absence` says why."""
+    """A run folder. `initial` is None where the initial candidate has no funnel, and `absence` says why.
+
+    `figures` is the folder that they are drawn into.
+    """
 
     path: Path
+    figures: Path
     name: str
     config: Config
     best: Shown
@@ -103,6 +107,7 @@ def read_run(path: Path) -> Run:
     folder = path / "elites"
     return Run(
         path=path,
+        figures=path / "figures",
         name=path.resolve().name,
         config=config,
         best=best,

@@ -139,6 +139,10 @@ def test_one_run_gets_its_page_and_figures_several_get_one_beside_them(tmp_path,
         for name in ("funnel", "levels", "courses", "convergence")
         for kind in ("png", "pdf")
     }
+    before = sorted(first.rglob("*"))
+    page, *drawn = report([first], tmp_path / "shared.html")
+    assert {path.parent for path in drawn} == {tmp_path / "shared_figures"}
+    assert sorted(first.rglob("*")) == before
     assert report([first, second])[0] == tmp_path / "comparison.html"
     assert report([first, second], tmp_path / "mine.html") == [
         tmp_path / f"mine.{kind}" for kind in ("html", "png", "pdf")
