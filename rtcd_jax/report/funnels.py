@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from rtcd_jax.config import Config
-from rtcd_jax.report.canvas import BLACK, GRAY, LIGHT, WIDTH, blank, written
+from rtcd_jax.report.canvas import BLACK, GRAY, LIGHT, SMALL, WIDTH, blank, written
 from rtcd_jax.report.reading import Run, Shown, shown
 from rtcd_jax.report.shapes import outlines, planes, projections
 from rtcd_jax.report.words import VOLUMES, listed, quantity, rung, volume_unit, words
@@ -61,10 +61,11 @@ def draw_over(runs: Sequence[Run], folder: Path, name: str) -> list[Path]:
             frame(axes, config, plane, window(funnels, plane))
         figure.legend(**told_once(panels), loc="outside upper center")
         for funnel in funnels:
-            volumes.semilogy(funnel.time, funnel.per_knot, color=funnel.color, label=_told(config, funnel))
+            volumes.semilogy(funnel.time, funnel.per_knot, color=funnel.color, label=_told_briefly(funnel))
         volumes.set(xlabel="time [s]", ylabel=f"volume of a knot's\nellipsoid [{volume_unit(config)}]")
         volumes.grid(axis="y", lw=0.4, color=LIGHT)
-        figure.legend(handles=volumes.lines, loc="outside lower center")
+        units = f"volumes in {volume_unit(config)}, integrals in {volume_unit(config, 'integral')}"
+        figure.legend(handles=volumes.lines, title=units, title_fontsize=SMALL, loc="outside lower center")
         return written(figure, folder, name)
 
 
@@ -138,7 +139,11 @@ def told_once(panels: Sequence["Axes"]) -> dict[str, Any]:
     """The entries of a legend, in one row, for all that the panels have in common."""
     found = [zip(*axes.get_legend_handles_labels(), strict=True) for axes in panels]
     handles = {label: handle for pairs in found for handle, label in pairs}
-    return {"handles": list(handles.values()), "labels": list(handles), "ncols": min(len(handles), 6)}
+    return {
+        "handles": list(handles.values()),
+        "labels": list(handles),
+        "ncols": len(handles) if len(handles) <= 6 else 4,
+    }
 
 
 def _time_colors(duration: float) -> "ScalarMappable":
@@ -183,6 +188,12 @@ def _told(config: Config, funnel: Shown) -> str:
     """The four volumes with their rung, which no volume is told without."""
     told = [f"{words(name)} {funnel.volumes[name]:.4g} {volume_unit(config, name)}" for name in VOLUMES]
     return f"{funnel.label}: {', '.join(told)}\n{rung(funnel.record)}"
+
+
+def _told_briefly(funnel: Shown) -> str:
+    told = [f"{words(name)} {funnel.volumes[name]:.3g}" for name in VOLUMES]
+    promise = f", ε = {funnel.record['epsilon']:.2g}" if funnel.record["rung"] == "sampled" else ""
+    return f"{funnel.label}: {', '.join(told)} ({funnel.record['rung']}{promise})"
 
 
 def _title(config: Config, funnel: Shown) -> str:

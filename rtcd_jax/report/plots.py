@@ -100,7 +100,7 @@ def convergence_plot(run: Run) -> Plot:
             "xaxis": {"title": {"text": "generation"}, "anchor": "y3"},
             "yaxis": {"title": {"text": f"volume ({words(objective)}) [{unit}]"}, "domain": [0.5, 1]},
             "yaxis2": {"title": {"text": "candidates by status"}, "domain": [0.23, 0.45], "range": [0, 1]},
-            "yaxis3": {"title": {"text": "step size σ"}, "domain": [0, 0.18], **_LOG},
+            "yaxis3": {"title": {"text": "step size σ"}, "domain": [0, 0.18], **_scale(column(generations, "sigma"))},
         },
     }
 
@@ -144,6 +144,11 @@ def course_plot(course: Course, index: Sequence[float | None]) -> Plot:
 
 
 _LOG: Mapping[str, str] = {"type": "log", "exponentformat": "e"}
+
+
+def _scale(values: np.ndarray) -> Mapping[str, str]:
+    """A logarithmic axis for more than one decade."""
+    return _LOG if np.nanmax(values) > 10 * np.nanmin(values) > 0 else {}
 
 
 def _body(funnel: Shown, plane: tuple[int, int]) -> Plot:

@@ -1,5 +1,6 @@
 """A finished run as reports show it: everything that its folder holds, checked once and given names."""
 
+import itertools
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -17,7 +18,9 @@ from rtcd_jax.storage import elite_names, read_config, read_elite, read_generati
 # Okabe and Ito's colors: told apart by all kinds of color vision.
 BLUE, VERMILION = "#0072B2", "#D55E00"
 COLORS = (VERMILION, "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
-"""Of compared runs, in turn; the initial candidate is blue."""
+"""Of compared runs, in turn."""
+INITIALS = (BLUE, "#5F6B7A", "#8C6D31", "#7A5195")
+"""Of their initial candidates, where they differ."""
 
 
 @final
@@ -177,12 +180,13 @@ def shown(runs: Sequence[Run]) -> list[Shown]:
             initials.append(run.initial)
     if len(initials) == 1:
         initials = [replace(initials[0], label="initial")]
-    return [*initials, *(run.best for run in runs)]
+    colors = itertools.cycle(INITIALS)
+    return [*(replace(initial, color=next(colors)) for initial in initials), *(run.best for run in runs)]
 
 
 def _same(first: Shown, second: Shown) -> bool:
-    """Whether two funnels are one candidate's."""
-    return np.array_equal(first.x, second.x) and np.array_equal(first.rho, second.rho)
+    """Whether two funnels are one candidate's: the same motion and values, however their levels were sampled."""
+    return first.x.shape == second.x.shape and np.allclose(first.x, second.x) and np.allclose(first.S, second.S)
 
 
 def _experiments(folder: Path) -> list[Experiment]:
