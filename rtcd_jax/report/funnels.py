@@ -18,6 +18,9 @@ if TYPE_CHECKING:
     from matplotlib.cm import ScalarMappable
     from matplotlib.figure import Figure
 
+MANY = 100
+"""Knots from which on lines and marks are finer."""
+
 
 def draw_funnels(run: Run) -> list[Path]:
     """Draws the best funnel beside the initial one, on the same axes; the files written.
@@ -82,7 +85,8 @@ def draw_shadows(axes: "Axes", funnels: Sequence[Shown], plane: tuple[int, int])
         whole = Curve.make_compound_path(*map(Curve, curves))
         axes.add_patch(PathPatch(whole, facecolor=to_rgba(funnel.color, 0.15), lw=0))
         edges = to_rgba(funnel.color, 0.45)
-        axes.add_collection(PolyCollection(curves, facecolors="none", edgecolors=edges, lw=0.5))
+        width = 0.5 if len(curves) <= MANY else 0.25
+        axes.add_collection(PolyCollection(curves, facecolors="none", edgecolors=edges, lw=width))
         axes.plot(*funnel.x[:, plane].T, color=funnel.color, label=funnel.label, zorder=3)
 
 
@@ -136,14 +140,11 @@ def _beside(figure: "Figure", run: Run) -> None:
 
 
 def told_once(panels: Sequence["Axes"]) -> dict[str, Any]:
-    """The entries of a legend, in one row, for all that the panels have in common."""
+    """The entries of a legend for all that the panels have in common, in one row where they fit."""
     found = [zip(*axes.get_legend_handles_labels(), strict=True) for axes in panels]
     handles = {label: handle for pairs in found for handle, label in pairs}
-    return {
-        "handles": list(handles.values()),
-        "labels": list(handles),
-        "ncols": len(handles) if len(handles) <= 6 else 4,
-    }
+    columns = len(handles) if len(handles) <= 6 else 4
+    return {"handles": list(handles.values()), "labels": list(handles), "ncols": columns}
 
 
 def _time_colors(duration: float) -> "ScalarMappable":

@@ -7,7 +7,7 @@ import numpy as np
 
 from rtcd_jax.config import Config
 from rtcd_jax.report.canvas import BLACK, GRAY
-from rtcd_jax.report.funnels import shadow, window
+from rtcd_jax.report.funnels import MANY, shadow, window
 from rtcd_jax.report.history import Course, column, courses, failures, spread
 from rtcd_jax.report.progress import GREEN, SPREAD, STATUS_COLORS, told_status
 from rtcd_jax.report.reading import BLUE, VERMILION, Run, Shown, shown
@@ -162,7 +162,7 @@ def _body(funnel: Shown, plane: tuple[int, int]) -> Plot:
         "mode": "lines",
         "fill": "toself",
         "fillcolor": _faint(funnel.color, 0.10),
-        "line": {"color": _faint(funnel.color, 0.45), "width": 0.6},
+        "line": {"color": _faint(funnel.color, 0.45), "width": 0.6 if len(funnel.time) <= MANY else 0.3},
         "name": funnel.label,
         "legendgroup": funnel.label,
         "showlegend": False,
@@ -179,7 +179,7 @@ def _motion(config: Config, funnel: Shown, plane: tuple[int, int]) -> Plot:
         "y": y,
         "mode": "lines+markers",
         "line": {"color": funnel.color, "width": 1.5},
-        "marker": {"size": 4 if len(funnel.time) <= 100 else 2.5},
+        "marker": {"size": 4 if len(funnel.time) <= MANY else 2.5},
         "name": funnel.label,
         "legendgroup": funnel.label,
         "customdata": [_numbers(row) for row in np.stack([funnel.time, funnel.rho, funnel.per_knot], axis=1)],
