@@ -30,7 +30,7 @@ def optimize(arguments: Sequence[str]) -> int:
 
     config, options = read_optimize(arguments, RUNS)
     _prepare_jax(options.cpu_devices)
-    from rtcd_jax.cluster import Cluster, Preempted, join
+    from rtcd_jax.cluster import Cluster, Lost, Preempted, join, part
 
     join(options.coordinator, options.num_processes, options.process_id)  # before any import that touches a device
     from rtcd_jax.console import Console, silent
@@ -43,15 +43,21 @@ def optimize(arguments: Sequence[str]) -> int:
             run_optimize(config, options.run, console, cluster)
         except Preempted:
             console.message(f"asked to stop (SIGTERM): saved in {options.run}; the same command goes on")
+            part()
             _leave(PREEMPTED)
+        except Lost as error:
+            print(f"rtcd: {error}; start all of them again by the same command, to go on", file=sys.stderr)
+            _leave(LOST_PROCESS)
+        except UserError as error:
+            if cluster.processes == 1:
+                raise
+            print(f"rtcd: {error}", file=sys.stderr)
+            _leave(WRONG_INPUT)
     return OK
 
 
 def _leave(code: int) -> NoReturn:
-    """Ends this process without waiting for what its devices still compute or compile."""
-    from rtcd_jax.cluster import part
-
-    part()
+    """Ends this process without waiting for what its devices still compute, or for other processes."""
     sys.stdout.flush()
     sys.stderr.flush()
     os._exit(code)
@@ -130,6 +136,35 @@ def check(arguments: Sequence[str]) -> int:
     return check_main(arguments)
 
 
+def falsify(arguments: Sequence[str]) -> int:
+    """simulate a great many motions of what a certificate says is proved"""
+    from rtcd_jax.options import read_falsify
+
+    options = read_falsify(arguments)
+    from rtcd_jax.certificate.falsify import falsify_file
+    from rtcd_jax.console import Console
+
+    with Console() as console:
+        held = falsify_file(options.certificate, options.rollouts, options.seed, options.workers, console)
+    return OK if held else BROKEN_PROMISE
+
+
+def audit(arguments: Sequence[str]) -> int:
+    """show where a funnel from outside fails, and mend its nominal for a proof"""
+    from rtcd_jax.options import read_audit
+
+    options = read_audit(arguments)
+    from rtcd_jax.certificate.audit import audit as run_audit
+    from rtcd_jax.certificate.outside import Cost, read_outside
+    from rtcd_jax.console import Console
+
+    given = read_outside(options.file, options.plant, options.numbers)
+    cost = Cost.of(given, options.q, options.r, options.state_limits)
+    with Console() as console:
+        held = run_audit(given, cost, options.states, options.seed, options.out, console)
+    return OK if held else BROKEN_PROMISE
+
+
 VERBS: dict[str, Callable[[Sequence[str]], int]] = {
     "optimize": optimize,
     "verify": verify,
@@ -138,6 +173,8 @@ VERBS: dict[str, Callable[[Sequence[str]], int]] = {
     "replay": replay,
     "certify": certify,
     "check": check,
+    "falsify": falsify,
+    "audit": audit,
 }
 
 

@@ -4,9 +4,10 @@ Nothing else mentions devices. Every process holds the same search state and tak
 differ between two machines (a clock, a signal, the last bits of an eigenvector) is process 0's, told to the others.
 """
 
+import contextlib
 import os
 import signal
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from functools import partial
 from typing import Any, TypeVar, final
@@ -41,6 +42,19 @@ def part() -> None:
 
 class Preempted(Exception):
     """The system asked this run to stop (SIGTERM): what is done is to be saved."""
+
+
+class Lost(Exception):
+    """Another process of this run has ended, or the link to it has."""
+
+
+@contextlib.contextmanager
+def _linked() -> Iterator[None]:
+    """Around what needs the other processes."""
+    try:
+        yield
+    except (jax.errors.JaxRuntimeError, ValueError) as error:  # the latter where an array is fetched
+        raise Lost(f"lost another process of this run ({str(error).splitlines()[0]})") from error
 
 
 @final
@@ -84,7 +98,10 @@ class Cluster:
 
     def agreed(self, value: Value) -> Value:
         """Process 0's numbers (a pytree of numpy's or Python's), on every process."""
-        return multihost_utils.broadcast_one_to_all(value) if self.processes > 1 else value
+        if self.processes == 1:
+            return value
+        with _linked():
+            return multihost_utils.broadcast_one_to_all(value)
 
     def on_first(self, act: Callable[[], Value]) -> Value | None:
         """Lets process 0 alone do something that the user may have to mend.
@@ -105,12 +122,19 @@ class Cluster:
     def require_alike(self, what: str, mark: str) -> None:
         """Raises UserError unless all processes have the same `mark`, at most 64 ASCII characters."""
         mine = np.frombuffer(mark.ljust(64).encode()[:64], np.uint8)
-        if self.processes > 1 and not np.all(multihost_utils.process_allgather(mine) == mine):
+        if self.processes == 1:
+            return
+        with _linked():
+            all_ = multihost_utils.process_allgather(mine)
+        if not np.all(all_ == mine):
             raise UserError(f"the processes of this run were started with different values of: {what}")
 
     def gathered(self, tree: Any) -> Any:
         """Arrays that are split over the mesh, whole and in numpy, on every process."""
-        return multihost_utils.process_allgather(tree, tiled=True) if self.processes > 1 else jax.device_get(tree)
+        if self.processes == 1:
+            return jax.device_get(tree)
+        with _linked():
+            return multihost_utils.process_allgather(tree, tiled=True)
 
     def replicated(self, tree: Any) -> Any:
         """Arrays that every process holds, as global arrays."""
@@ -128,15 +152,17 @@ class Cluster:
 
     def shared(self, function: Callable) -> Callable:
         """`function(split, whole) -> split`, jitted: every device runs it on its own part, in step with none."""
-        mapped = jax.shard_map(
-            function, mesh=self.mesh, in_specs=(SPLIT, WHOLE), out_specs=SPLIT, check_vma=False
-        )
+        mapped = jax.shard_map(function, mesh=self.mesh, in_specs=(SPLIT, WHOLE), out_specs=SPLIT, check_vma=False)
         return jax.jit(mapped)
 
     def heed(self) -> None:
         """From now on SIGTERM asks this run to stop; JAX itself listens where there are several processes."""
         if self.processes == 1:
-            signal.signal(signal.SIGTERM, lambda *_: setattr(self, "_asked", True))
+            signal.signal(signal.SIGTERM, lambda *_: self.ask_to_stop())
+
+    def ask_to_stop(self) -> None:
+        """Makes the next look raise."""
+        self._asked = True
 
     def look(self) -> None:
         """Raises Preempted if this run was asked to stop; in all processes at the same one of their looks."""

@@ -63,12 +63,18 @@ class RunFolder:
         self._begun = self._saved = time.monotonic()
 
     @classmethod
-    def open(cls, path: Path, config: Config, cluster: "Cluster") -> Self:
+    def open(cls, path: Path, config: Config, cluster: "Cluster | None" = None) -> Self:
         """The folder of a new run, or of the one that `config` began: then `restore` gives the state to go on from.
+
+        Without a `cluster` it is that of this process' devices.
 
         Raises UserError if the folder holds something else, a run of another configuration (every differing key with
         both values) or of another format, if another run works on it, or if the processes were not started alike.
         """
+        if cluster is None:
+            from rtcd_jax.cluster import Cluster
+
+            cluster = Cluster.of()
         cluster.require_alike("configuration", configuration.config_hash(config))
         with contextlib.ExitStack() as stack:
             cluster.on_first(lambda: stack.enter_context(_prepared(path, config)))

@@ -44,11 +44,15 @@ def first_failure(*statuses: Int[Array, ""]) -> Int[Array, ""]:
 
 
 class Candidate(eqx.Module):
-    """What the search chooses: the robot's design and the diagonals of the cost weights Q and R."""
+    """What the search chooses: the robot's design, the diagonals of the cost weights Q and R, and what it is asked to
+    choose of the policy's options; None is the configuration's number.
+    """
 
     design: eqx.Module
     q: Float[Array, " n"]
     r: Float[Array, " m"]
+    authority: Float[Array, ""] | None = None
+    discount: Float[Array, ""] | None = None
 
 
 class Trajectory(eqx.Module):

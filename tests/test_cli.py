@@ -153,9 +153,10 @@ def run_module(monkeypatch):
     """Stands in for the run: records what the command line hands over."""
     calls = []
     module = types.ModuleType("rtcd_jax.run")
-    module.optimize = lambda config, folder, console: calls.append((config, folder))
+    module.optimize = lambda config, folder, console, cluster: calls.append((config, folder))
     monkeypatch.setitem(sys.modules, "rtcd_jax.run", module)
-    monkeypatch.setattr(cli, "_prepare_jax", lambda: None)
+    monkeypatch.setattr(cli, "_prepare_jax", lambda *_: None)
+    monkeypatch.setattr("rtcd_jax.cluster.Cluster.heed", lambda cluster: None)  # signals stay pytest's
     module.calls = calls
     return module
 
@@ -217,7 +218,7 @@ def test_verify_exits_by_the_promise(monkeypatch, tmp_path, held, code):
     module = types.ModuleType("rtcd_jax.verify")
     module.verify_run = lambda folder, states, seed, console: calls.append((folder, states, seed)) or held
     monkeypatch.setitem(sys.modules, "rtcd_jax.verify", module)
-    monkeypatch.setattr(cli, "_prepare_jax", lambda: None)
+    monkeypatch.setattr(cli, "_prepare_jax", lambda *_: None)
     assert cli.main(["verify", str(tmp_path), "--states", "10", "--seed", "3"]) == code
     assert calls == [(tmp_path, 10, 3)]
 
@@ -281,3 +282,35 @@ def test_help_imports_nothing_but_the_standard_library():
     )
     process = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=ROOT)
     assert process.stdout.splitlines()[-1] == "set()"
+
+
+def test_asked_to_stop_a_run_leaves_with_the_exit_code_for_that(run_module, capsys, monkeypatch):
+    from rtcd_jax.cluster import Preempted
+
+    def asked(*arguments):
+        raise Preempted
+
+    class Left(BaseException):
+        pass
+
+    def leave(code):
+        raise Left(code)
+
+    run_module.optimize = asked
+    monkeypatch.setattr(cli.os, "_exit", leave)
+    with pytest.raises(Left, match=r"^85$"):
+        cli.main(["optimize", RTCD])
+    assert "saved in checkpoints/pendulum_rtcd; the same command goes on" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--devices", "0"], r"--devices = 0: must be >= 1"),
+        (["--coordinator", "a:1"], r"--num_processes, --process_id: must be given too"),
+        (["--coordinator", "a:1", "--num_processes", "2", "--process_id", "2"], r"must be < --num_processes = 2"),
+    ],
+)
+def test_devices_and_processes_are_checked_before_anything_starts(options, message, capsys):
+    assert cli.main(["optimize", RTCD, *options]) == 2
+    assert re.search(message, capsys.readouterr().err)

@@ -19,6 +19,7 @@ import yaml
 
 from rtcd_jax import config as configuration
 from rtcd_jax import run
+from rtcd_jax.cluster import Cluster
 from rtcd_jax.console import Console
 from rtcd_jax.errors import UserError
 from rtcd_jax.run import LAST_FILE
@@ -227,7 +228,7 @@ def _run_with(monkeypatch, evaluate, folder):
     monkeypatch.setattr(run, "resample", lambda problem, effort, row, key: eqx.tree_at(
         lambda e: e.status, row, jnp.int32(Status.FUNNEL_EMPTY)))  # fmt: skip
     with Console(io.StringIO()) as console:
-        run.optimize(configuration.parse(SMALL), folder, console)
+        run.optimize(configuration.parse(SMALL), folder, console, Cluster.of())
 
 
 def test_a_run_without_any_funnel_says_why(monkeypatch, tmp_path):
