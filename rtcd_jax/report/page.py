@@ -100,7 +100,8 @@ def _candidate(run: Run) -> str:
     record = run.best.record
     design = [listed(name, value, run.config.plant.design[name]) for name, value in record["design"].items()]
     weights = [listed(name, value) for name, value in record["weights"].items()]
-    return html.escape("best: " + ", ".join([*design, *weights]))
+    options = [listed(name, record["policy"][name]) for name in run.config.policy.variables()]
+    return html.escape("best: " + ", ".join([*design, *weights, *options]))
 
 
 def _headlines(run: Run) -> Iterator[tuple[str, str, str]]:

@@ -60,6 +60,16 @@ def test_a_browser_shows_every_figure_without_error_or_request_or_sideways_scrol
     assert len(set(tab.value(width))) == 1
 
 
+def test_a_page_that_asks_for_something_or_complains_would_be_seen(tmp_path, chromium):
+    path = tmp_path / "bad.html"
+    path.write_text(
+        "<!doctype html><img src='http://127.0.0.1:9/x.png'><script>console.error('no'); missing();</script>"
+    )
+    tab = chromium.open(path, browser.LAPTOP)
+    assert tab.requests() == ["http://127.0.0.1:9/x.png"]
+    assert len(tab.complaints()) >= 2
+
+
 SUMS = """(() => {
   const table = [...document.querySelectorAll("section")].find((s) => s.querySelector("h2").textContent === "Elites");
   const heads = [...table.querySelectorAll("th")];
