@@ -73,7 +73,7 @@ def verify(arguments: Sequence[str]) -> int:
     from rtcd_jax.verify import verify_run
 
     with Console() as console:
-        held = verify_run(options.run, options.states, options.seed, console)
+        held = verify_run(options.run, options.states, options.seed, options.workers or _cores(), console)
     return OK if held else BROKEN_PROMISE
 
 

@@ -45,11 +45,15 @@ class OptimizeOptions:
 
 @dataclass(frozen=True)
 class VerifyOptions:
-    """Simulate fresh random states of a run's funnels with independent integrators; exit code 1 if too many fail."""
+    """Simulate fresh random states of a run's funnels with independent integrators; exit code 1 if too many fail.
+
+    The same command goes on after a stop. Example: rtcd verify checkpoints/pendulum_rtcd --states 100000
+    """
 
     run: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RUN", help="the run folder")]
     states: Annotated[int, tyro.conf.arg(help="fresh states, over the ellipsoids of all knots [-] (>= knots)")] = 1000
     seed: Annotated[int, tyro.conf.arg(help="of the states [-] (>= 0)")] = 0
+    workers: Annotated[int, tyro.conf.arg(help="processes, 0 for one a core [-] (>= 0)")] = 0
 
 
 @dataclass(frozen=True)
@@ -192,10 +196,9 @@ def _require_processes(options: OptimizeOptions) -> None:
 def read_verify(arguments: Sequence[str]) -> VerifyOptions:
     """The checked options of `rtcd verify`; `UserError` if one is out of range."""
     options = tyro.cli(VerifyOptions, args=arguments, prog="rtcd verify", use_underscores=True)
-    if options.states < 1:
-        raise UserError(f"--states = {options.states}: must be >= 1")
-    if options.seed < 0:
-        raise UserError(f"--seed = {options.seed}: must be >= 0")
+    for name, least in (("states", 1), ("seed", 0), ("workers", 0)):
+        if getattr(options, name) < least:
+            raise UserError(f"--{name} = {getattr(options, name)}: must be >= {least}")
     _require_run(options.run)
     return options
 

@@ -216,7 +216,7 @@ def test_a_bug_is_no_user_error(run_module):
 def test_verify_exits_by_the_promise(monkeypatch, tmp_path, held, code):
     calls = []
     module = types.ModuleType("rtcd_jax.verify")
-    module.verify_run = lambda folder, states, seed, console: calls.append((folder, states, seed)) or held
+    module.verify_run = lambda folder, states, seed, workers, console: calls.append((folder, states, seed)) or held
     monkeypatch.setitem(sys.modules, "rtcd_jax.verify", module)
     monkeypatch.setattr(cli, "_prepare_jax", lambda *_: None)
     assert cli.main(["verify", str(tmp_path), "--states", "10", "--seed", "3"]) == code
