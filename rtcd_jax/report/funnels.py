@@ -52,7 +52,7 @@ def draw_levels(run: Run) -> list[Path]:
 
 
 def draw_over(runs: Sequence[Run], folder: Path, name: str) -> list[Path]:
-    """Draws the funnels of several runs over one another, as the paper does, and their volumes over time.
+    """Draws the funnels of one run or several over one another, as the paper does, and their volumes over time.
 
     The largest lies lowest. Raises UserError if the folder cannot be written.
     """

@@ -57,7 +57,8 @@ def report(folders: Sequence[Path], to: Path | None = None) -> list[Path]:
 
 def draw_figures(run: Run) -> list[Path]:
     """The figures of one run, NAME.png and .pdf in `run.figures`. Raises UserError if they cannot be written."""
-    return [path for draw in (draw_funnels, draw_levels, draw_courses, draw_convergence) for path in draw(run)]
+    over = draw_over([run], run.figures, "overlay")
+    return over + [path for draw in (draw_funnels, draw_levels, draw_courses, draw_convergence) for path in draw(run)]
 
 
 def render(runs: Sequence[Run]) -> str:
@@ -186,7 +187,8 @@ def _certified(runs: Sequence[Run]) -> Iterator[str]:
 def _pictures(found: Experiment) -> Iterator[str]:
     for path in found.pictures:
         data = base64.b64encode(path.read_bytes()).decode()
-        yield f'<img src="data:image/png;base64,{data}" alt="{html.escape(words(path.stem))}">'
+        picture = f'<img src="data:image/png;base64,{data}" alt="{html.escape(words(path.stem))}">'
+        yield f'<div class="scroll">{picture}</div>'
 
 
 def _section(title: str, *parts: str) -> str:

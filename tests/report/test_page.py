@@ -146,7 +146,7 @@ def test_one_run_gets_its_page_and_figures_several_get_one_beside_them(tmp_path,
     assert page == first / "report.html"
     assert {path.relative_to(first) for path in drawn} == {
         first.relative_to(first) / "figures" / f"{name}.{kind}"
-        for name in ("funnel", "levels", "courses", "convergence")
+        for name in ("overlay", "funnel", "levels", "courses", "convergence")
         for kind in ("png", "pdf")
     }
     before = sorted(first.rglob("*"))
