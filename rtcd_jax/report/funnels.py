@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 MANY = 100
-"""Knots from which on lines and marks are finer."""
+"""Knots from which on lines and marks are finer, and outlines coarser."""
 
 
 def draw_funnels(run: Run) -> list[Path]:
@@ -83,15 +83,17 @@ def draw_shadows(axes: "Axes", funnels: Sequence[Shown], plane: tuple[int, int])
         curves = list(shadow(funnel, plane))
         # One curve of all ellipses is filled once: their shades do not add up where they overlap.
         whole = Curve.make_compound_path(*map(Curve, curves))
-        axes.add_patch(PathPatch(whole, facecolor=to_rgba(funnel.color, 0.15), lw=0))
+        # add_patch would look at every segment for limits that are set anyway.
+        axes.add_artist(PathPatch(whole, facecolor=to_rgba(funnel.color, 0.15), lw=0))
         edges = to_rgba(funnel.color, 0.45)
         width = 0.5 if len(curves) <= MANY else 0.25
         axes.add_collection(PolyCollection(curves, facecolors="none", edgecolors=edges, lw=width))
         axes.plot(*funnel.x[:, plane].T, color=funnel.color, label=funnel.label, zorder=3)
 
 
-def shadow(funnel: Shown, plane: tuple[int, int], points: int = 181) -> Float[np.ndarray, "knots points 2"]:
+def shadow(funnel: Shown, plane: tuple[int, int], points: int | None = None) -> Float[np.ndarray, "knots points 2"]:
     """Outlines of a funnel's ellipsoids in a plane."""
+    points = points or (181 if len(funnel.time) <= MANY else 91)
     return outlines(funnel.x[:, plane], projections(funnel.S, funnel.rho, plane), points)
 
 
