@@ -155,7 +155,9 @@ class ReplayOptions:
 
     run: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RUN", help="the run folder")]
     file: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="FILE", help="the measured states, a CSV file")]
-    elite: Annotated[int, tyro.conf.arg(metavar="K", help="whose funnel; 0 is the best [-] (>= 0)")] = 0
+    elite: Annotated[
+        int | Literal["initial"], tyro.conf.arg(metavar="K", help="whose funnel; 0 is the best [-] (>= 0); or initial")
+    ] = 0
 
 
 @dataclass(frozen=True)
@@ -296,8 +298,8 @@ def read_animate(arguments: Sequence[str]) -> AnimateOptions:
 def read_replay(arguments: Sequence[str]) -> ReplayOptions:
     """The checked options of `rtcd replay`; `UserError` if one is out of range."""
     options = tyro.cli(ReplayOptions, args=arguments, prog="rtcd replay", use_underscores=True)
-    if options.elite < 0:
-        raise UserError(f"--elite = {options.elite}: must be >= 0")
+    if isinstance(options.elite, int) and options.elite < 0:
+        raise UserError(f"--elite = {options.elite}: must be >= 0, or initial")
     _require_run(options.run)
     return options
 

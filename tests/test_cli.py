@@ -115,7 +115,10 @@ WRONG = {
     "negative seed to animate": (["animate", "configs", "--seed", "-1"], "--seed = -1: must be >= 0"),
     "no such run to replay": (["replay", "no/such/run", "x.csv"], "no/such/run: no such run folder"),
     "nothing to replay": (["replay", "configs"], "FILE"),
-    "negative elite to replay": (["replay", "configs", "x.csv", "--elite", "-1"], "--elite = -1: must be >= 0"),
+    "negative elite to replay": (
+        ["replay", "configs", "x.csv", "--elite", "-1"],
+        "--elite = -1: must be >= 0, or initial",
+    ),
     "misspelt verify option": (["verify", "configs", "--sed", "1"], "--seed"),
 }
 
@@ -230,8 +233,9 @@ def test_replay_exits_by_the_funnel(monkeypatch, tmp_path, kept, code):
     module = types.ModuleType("rtcd_jax.report.replay")
     module.replay_run = lambda folder, file, elite, console: calls.append((folder, file, elite)) or kept
     monkeypatch.setitem(sys.modules, "rtcd_jax.report.replay", module)
-    assert cli.main(["replay", str(tmp_path), "lab.csv", "--elite", "2"]) == code
-    assert calls == [(tmp_path, Path("lab.csv"), 2)]
+    for elite in ("2", "initial"):
+        assert cli.main(["replay", str(tmp_path), "lab.csv", "--elite", elite]) == code
+    assert calls == [(tmp_path, Path("lab.csv"), 2), (tmp_path, Path("lab.csv"), "initial")]
 
 
 @pytest.mark.parametrize(
