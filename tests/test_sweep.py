@@ -62,7 +62,8 @@ def test_keys_of_one_last_name_are_told_apart(tmp_path):
         ({"product": {"search.seed": [1]}, "zip": {"search.seed": [2]}}, "in product or in zip, not in both"),
         ({"product": {"search.sed": [1]}}, r"case 000_sed=1: 1 error\n.*search.sed.*did you mean 'seed'"),
         ({"product": {"search.seed": [1, -1]}}, r"case 001_seed=-1: 1 error\n.*search.seed = -1: must be >= 0"),
-        ({"product": {"search.seed.deep": [1]}}, "seed is no section"),
+        ({"product": {"search.seed.deep": [1]}}, r"sweep.search.seed.deep: leads to no place in the file"),
+        ({"product": {"weights.r.7.max": [1]}}, r"sweep.weights.r.7.max: leads to no place in the file"),
     ],
 )
 def test_what_is_wrong_is_named(tmp_path, sweep, message):

@@ -12,6 +12,8 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 
+from rtcd_jax.backend import prepare_jax
+
 CONFIGS = Path(__file__).parents[2] / "configs"
 CANDIDATES = {  # the design variables, then the diagonals of Q and R (paper, table I and the authors' results)
     "pendulum": {
