@@ -79,8 +79,8 @@ def on_grid(matrix: np.ndarray) -> list[list]:
 class Descent:
     """The search for one elite's funnel. `exact` asks the checker after every interval (rung *proved*)."""
 
-    def __init__(self, claim: Claim, loop: Loop, exact: bool, evenness: float | None = None):
-        self.claim, self.loop, self.exact, self.evenness = claim, loop, exact, evenness
+    def __init__(self, claim: Claim, loop: Loop, exact: bool, aim: flow.Aim | None = None):
+        self.claim, self.loop, self.exact, self.aim = claim, loop, exact, aim
         self._directions = directions(claim.n)
 
     def outlet(self, rho: float) -> Front:
@@ -124,7 +124,7 @@ class Descent:
 
     def _attempt(self, k: int, start: float, end: float, front: Front, spare: float) -> Proved | None:
         try:
-            shape = self._piece if self.evenness is None else self._fastest_piece
+            shape = self._piece if self.aim is None else self._fastest_piece
             piece, rho = shape(k, start, end, front, spare)
             check.insist_bounds(self.claim, check.motion(self.claim, piece), "limits")
             piece, todo, degree = self._models(piece, spare)
@@ -162,7 +162,7 @@ class Descent:
         loop, duration = self.loop, (end - start) * self.loop.dt
         b = np.array([[float(c) for c in row] for row in front.axes])
         aims = self._directions[:, ::AIMS_SHARED]
-        w = flow.fastest_growth(loop, k, start, end, b, spare, cast(float, self.evenness), aims)
+        w = flow.fastest_growth(loop, k, start, end, b, spare, cast(flow.Aim, self.aim), aims)
         if w is None:
             raise Refused("interval", "no ellipsoid can be carried back")
         a = b @ expm(-w * duration)
