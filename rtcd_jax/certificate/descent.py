@@ -90,9 +90,9 @@ class Descent:
 
     def down_from(self, front: Front) -> Iterator[Proved]:
         """The intervals from the front back to t = 0, or to where nothing can be proved."""
-        waiting = [(k, 0.0, 1.0) for k in range(front.knot)]
-        if front.share > 0:
-            waiting.append((front.knot, 0.0, front.share))
+        parts = [(0.0, 1.0)] if self.aim is None else flow.shares(self.loop)
+        waiting = [(k, *part) for k in range(front.knot) for part in parts]
+        waiting += [(front.knot, start, min(end, front.share)) for start, end in parts if start < front.share]
         while waiting:
             k, start, end = waiting.pop()
             short = end - start <= SHORTEST

@@ -14,7 +14,7 @@ the volume grows fastest, with much of it the largest level set of TVLQR inside 
 them a power mean of the half axes measured by S.
 """
 
-import itertools
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -44,7 +44,7 @@ SHARE_OF_LIMIT = 0.99
 WIDEST = 2.0
 """Largest half width [rad] along the angle: beyond it polynomials follow the sine badly."""
 LONGEST = 0.05
-"""Longest interval [s] of predictions: one W for a longer one is too coarse."""
+"""Longest interval [s]: one W for a longer one gives volume away."""
 PREDICTED_SPARE = 0.02
 """Spare rate [1/s] of predictions."""
 KEPT_INLET = 0.5
@@ -106,15 +106,20 @@ def _limits(loop: Loop, k: int, share: float, axes: np.ndarray, pairs: list) -> 
 def predicted(loop: Loop, axes: np.ndarray, aim: Aim, y: np.ndarray) -> np.ndarray | None:
     """Volumes [N+1], knots first, up to the unit ball's, if every interval goes through; None if it cannot."""
     volumes = [np.linalg.det(axes)]
-    shares = np.linspace(1, 0, int(np.ceil(loop.dt / LONGEST)) + 1)
     for k in range(len(loop.u) - 1, -1, -1):
-        for end, start in itertools.pairwise(shares):
+        for start, end in reversed(shares(loop)):
             w = fastest_growth(loop, k, start, end, axes, PREDICTED_SPARE, aim, y)
             if w is None:
                 return None
             axes = axes @ expm(-w * (end - start) * loop.dt)
         volumes.append(np.linalg.det(axes))
     return np.array(volumes[::-1])
+
+
+def shares(loop: Loop) -> list[tuple[float, float]]:
+    """The parts of a knots' interval that get a W each."""
+    parts = 2 ** max(math.ceil(math.log2(loop.dt / LONGEST)), 0)
+    return [(i / parts, (i + 1) / parts) for i in range(parts)]
 
 
 def best_aim(loop: Loop, axes: np.ndarray, rhos: np.ndarray, y: np.ndarray) -> Aim | None:
