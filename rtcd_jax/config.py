@@ -265,7 +265,9 @@ class SearchConfig(Settings):
     )
     sigma: float = Field(default=0.3, gt=0, le=1, description="initial step size in the unit box [-]")
     seed: int = Field(default=0, ge=0, lt=2**32, description="of all random numbers [-]")
-    chunk: int = Field(default=32, ge=1, description="candidates solved together, which bounds the memory [-]")
+    chunk: int = Field(
+        default=64, ge=1, description="candidates that a device evaluates at once, which bounds its memory [-]"
+    )
     nested: NestedConfig = Field(
         default=NestedConfig(), description="budget of the two loops, used in mode nested alone"
     )

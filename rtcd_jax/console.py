@@ -95,6 +95,11 @@ class Console:
         self._bar.update(self._bar.task_ids[0], completed=now.done, description=str(now), refresh=True)
 
 
+def silent() -> Console:
+    """One that says nothing: for processes beside the first."""
+    return Console(terminal=Terminal(quiet=True))
+
+
 def _volume(value: float) -> str:
     return "none" if math.isnan(value) else f"{value:.5g}"
 

@@ -13,6 +13,7 @@ from rtcd_jax.config import EXAMPLE, UNIT, Config, Variable, load, parse, parse_
 from rtcd_jax.errors import UserError
 from rtcd_jax.settings import Settings, bounds
 
+_COORDINATOR = "where process 0 listens; srun and mpirun need none"
 POLICY_UNITS = {"authority": "-", "discount": "1/s"}
 OPTIMIZE_USAGE = "rtcd optimize CONFIG [--run FOLDER] [--KEY VALUE …]"
 
@@ -35,15 +36,63 @@ class OptimizeOptions:
     config: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="CONFIG", help="the experiment, a YAML file")]
     settings: Annotated[Branch, tyro.conf.arg(name="")]
     run: Annotated[Path, tyro.conf.arg(metavar="FOLDER", help="run folder, resumed if it is there")]
+    devices: Annotated[int | None, tyro.conf.arg(help="devices to use of those each process sees [-] (all)")] = None
+    cpu_devices: Annotated[int | None, tyro.conf.arg(help="parts the CPU is split into [-] (its cores)")] = None
+    coordinator: Annotated[str | None, tyro.conf.arg(metavar="HOST:PORT", help=_COORDINATOR)] = None
+    num_processes: Annotated[int | None, tyro.conf.arg(help="processes of this run [-] (known under srun)")] = None
+    process_id: Annotated[int | None, tyro.conf.arg(help="this one's number [-] (0 …, known under srun)")] = None
 
 
 @dataclass(frozen=True)
 class VerifyOptions:
-    """Simulate fresh random states of a run's funnels with independent integrators; exit code 1 if too many fail."""
+    """Simulate fresh random states of a run's funnels with independent integrators; exit code 1 if too many fail.
+
+    The same command goes on after a stop. Example: rtcd verify checkpoints/pendulum_rtcd --states 100000
+    """
 
     run: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RUN", help="the run folder")]
     states: Annotated[int, tyro.conf.arg(help="fresh states, over the ellipsoids of all knots [-] (>= knots)")] = 1000
     seed: Annotated[int, tyro.conf.arg(help="of the states [-] (>= 0)")] = 0
+    workers: Annotated[int, tyro.conf.arg(help="processes, 0 for one a core [-] (>= 0)")] = 0
+
+
+@dataclass(frozen=True)
+class ReportOptions:
+    """Write a finished run's page, report.html, and its figures; several runs are compared on one page.
+
+    Example: rtcd report checkpoints/pendulum_rtc checkpoints/pendulum_rtcd --to comparison.html
+    """
+
+    runs: Annotated[
+        tyro.conf.Positional[tuple[Path, ...]], tyro.conf.arg(metavar="RUN [RUN …]", help="the run folders")
+    ]
+    to: Annotated[Path | None, tyro.conf.arg(metavar="FILE", help="the page; by default in or beside the run")] = None
+
+
+@dataclass(frozen=True)
+class AnimateOptions:
+    """Show the swing-up by MuJoCo's renderer as MP4 and GIF: initial beside best, undisturbed and disturbed.
+
+    Needs no display: it draws by EGL or OSMesa. Example: rtcd animate checkpoints/pendulum_rtcd --to videos
+    """
+
+    run: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RUN", help="the run folder")]
+    to: Annotated[Path | None, tyro.conf.arg(metavar="DIR", help="for the videos; by default animation/ in RUN")] = None
+    seed: Annotated[int, tyro.conf.arg(help="of the disturbed start, from the first ellipsoid [-] (>= 0)")] = 0
+
+
+@dataclass(frozen=True)
+class ReplayOptions:
+    """Was a measured run inside the funnel? V/rho of every sample; exit code 1 if it left.
+
+    FILE has the columns time,pos,vel,torque or time,pos1,pos2,vel1,vel2,tau1,tau2 in SI units, the time from the start
+    of the swing-up. Errors of angles are not wrapped: unwrap the encoder first.
+    Example: rtcd replay checkpoints/pendulum_rtcd measured.csv --elite 0
+    """
+
+    run: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RUN", help="the run folder")]
+    file: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="FILE", help="the measured states, a CSV file")]
+    elite: Annotated[int, tyro.conf.arg(metavar="K", help="whose funnel; 0 is the best [-] (>= 0)")] = 0
 
 
 @dataclass(frozen=True)
@@ -113,8 +162,8 @@ class AuditOptions:
         return found
 
 
-def read_optimize(arguments: Sequence[str], runs: Path) -> tuple[Config, Path]:
-    """The configuration with its overrides, and the run folder.
+def read_optimize(arguments: Sequence[str], runs: Path) -> tuple[Config, OptimizeOptions]:
+    """The configuration with its overrides, and the options beside it.
 
     Raises `UserError` for a wrong YAML or value; tyro itself exits with code 2 for an unknown option.
     """
@@ -126,18 +175,59 @@ def read_optimize(arguments: Sequence[str], runs: Path) -> tuple[Config, Path]:
     else:
         raise UserError(f"the configuration comes first, but found {arguments[0]!r}: {OPTIMIZE_USAGE}")
     options = _parse(arguments, OptimizeOptions(config=tyro.MISSING, settings=_config_branch(defaults), run=folder))
-    return parse(options.settings, f"{options.config} with the options given"), options.run
+    _require_processes(options)
+    return parse(options.settings, f"{options.config} with the options given"), options
+
+
+def _require_processes(options: OptimizeOptions) -> None:
+    """All of coordinator, number and id, or none of them."""
+    for name, smallest in (("devices", 1), ("cpu_devices", 1), ("num_processes", 1), ("process_id", 0)):
+        value = getattr(options, name)
+        if value is not None and value < smallest:
+            raise UserError(f"--{name} = {value}: must be >= {smallest}")
+    together = {name: getattr(options, name) for name in ("coordinator", "num_processes", "process_id")}
+    missing = [f"--{name}" for name, value in together.items() if value is None]
+    if 0 < len(missing) < len(together):
+        raise UserError(f"{', '.join(missing)}: must be given too; a process needs all of --{', --'.join(together)}")
+    if options.process_id is not None and options.process_id >= options.num_processes:
+        raise UserError(f"--process_id = {options.process_id}: must be < --num_processes = {options.num_processes}")
 
 
 def read_verify(arguments: Sequence[str]) -> VerifyOptions:
     """The checked options of `rtcd verify`; `UserError` if one is out of range."""
     options = tyro.cli(VerifyOptions, args=arguments, prog="rtcd verify", use_underscores=True)
-    if options.states < 1:
-        raise UserError(f"--states = {options.states}: must be >= 1")
+    for name, least in (("states", 1), ("seed", 0), ("workers", 0)):
+        if getattr(options, name) < least:
+            raise UserError(f"--{name} = {getattr(options, name)}: must be >= {least}")
+    _require_run(options.run)
+    return options
+
+
+def read_report(arguments: Sequence[str]) -> ReportOptions:
+    """The checked options of `rtcd report`; `UserError` if a run is missing."""
+    options = tyro.cli(ReportOptions, args=arguments, prog="rtcd report", use_underscores=True)
+    if not options.runs:
+        raise UserError("which run? rtcd report RUN [RUN …] [--to FILE]")
+    for run in options.runs:
+        _require_run(run)
+    return options
+
+
+def read_animate(arguments: Sequence[str]) -> AnimateOptions:
+    """The checked options of `rtcd animate`; `UserError` if one is out of range."""
+    options = tyro.cli(AnimateOptions, args=arguments, prog="rtcd animate", use_underscores=True)
     if options.seed < 0:
         raise UserError(f"--seed = {options.seed}: must be >= 0")
-    if not options.run.is_dir():
-        raise UserError(f"{options.run}: no such run folder; `{OPTIMIZE_USAGE}` makes one")
+    _require_run(options.run)
+    return options
+
+
+def read_replay(arguments: Sequence[str]) -> ReplayOptions:
+    """The checked options of `rtcd replay`; `UserError` if one is out of range."""
+    options = tyro.cli(ReplayOptions, args=arguments, prog="rtcd replay", use_underscores=True)
+    if options.elite < 0:
+        raise UserError(f"--elite = {options.elite}: must be >= 0")
+    _require_run(options.run)
     return options
 
 
@@ -147,9 +237,13 @@ def read_certify(arguments: Sequence[str]) -> CertifyOptions:
     for name in ("elites", "workers"):
         if getattr(options, name) < 1:
             raise UserError(f"--{name} = {getattr(options, name)}: must be >= 1")
-    if not options.run.is_dir():
-        raise UserError(f"{options.run}: no such run folder; `{OPTIMIZE_USAGE}` makes one")
+    _require_run(options.run)
     return options
+
+
+def _require_run(folder: Path) -> None:
+    if not folder.is_dir():
+        raise UserError(f"{folder}: no such run folder; `{OPTIMIZE_USAGE}` makes one")
 
 
 def read_audit(arguments: Sequence[str]) -> AuditOptions:

@@ -7,6 +7,7 @@ binds `N` at the first annotation and can evaluate `N+1` only afterwards.
 import enum
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
@@ -113,3 +114,7 @@ class Evaluation(eqx.Module):
     funnel: Funnel
     volumes: Volumes
     status: Int[Array, ""]
+
+    def take(self, rows) -> "Evaluation":
+        """Of a population's evaluation: the candidates at `rows` [E]."""
+        return jax.tree.map(lambda leaf: leaf[rows], self)

@@ -19,7 +19,8 @@ LAYERS = (
     {"population", "trajectory", "policy", "rollout"},
     {"confirmation"},
     {"funnel", "volume"},
-    {"evaluation", "results"},
+    {"evaluation", "results", "cluster"},
+    {"spread"},
     {"cmaes", "elites", "loops"},
     {"search"},
     {"storage"},
@@ -40,6 +41,8 @@ OWNERS = {
     "tyro": {"options"},
     "yaml": {"config"},
     "matplotlib": {"report"},
+    "PIL": {"report"},
+    "imageio_ffmpeg": {"report"},
     "pydantic": {"settings", "config", "options"},
     "pydantic_core": {"settings"},
 }

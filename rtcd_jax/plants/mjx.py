@@ -108,13 +108,13 @@ class MjxStepper(eqx.Module):
 
 
 class CpuDynamics:
-    """State derivatives of many states of one model by C MuJoCo, on all cores of this process.
+    """State derivatives of many states of one model by C MuJoCo, in one thread.
 
     It knows nothing of JAX: the independent witness of the closed form and of MJX.
     """
 
     def __init__(self, model: mujoco.MjModel, capacity: int):
-        self._batch = Batch(model, nsim=capacity)
+        self._batch = Batch(model, nsim=capacity, nthread=1)
         self._fields = tuple(self._batch.bind(name) for name in ("qpos", "qvel", "ctrl", "qacc"))
 
     def __call__(self, x: Float[np.ndarray, "states n"], u: Float[np.ndarray, "states m"]) -> np.ndarray:
@@ -144,7 +144,8 @@ def _template(robot: type[Plant], dtype: np.dtype) -> tuple[mjx.Model, mjx.Data]
     # L'DL written out elementwise: a batched dense Cholesky calls LAPACK once a lane on the CPU.
     model.opt.jacobian = mujoco.mjtJacobian.mjJAC_SPARSE
     with jax.ensure_compile_time_eval(), _promotion():
-        pair = mjx.put_model(model, impl="jax"), mjx.make_data(model, impl="jax")
+        here = jax.local_devices()[0]  # by default MJX takes the first one of all processes
+        pair = mjx.put_model(model, here, impl="jax"), mjx.make_data(model, here, impl="jax")
         return jax.tree.map(lambda leaf: _as_float(np.asarray(leaf), dtype), pair)
 
 
