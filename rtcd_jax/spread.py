@@ -8,7 +8,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import cast, final
+from typing import Any, cast, final
 
 import jax
 import jax.numpy as jnp
@@ -71,7 +71,7 @@ def spread(evaluate: Evaluate, cluster: Cluster, chunk: int) -> Callable[[Float[
 
 
 def _seen(cluster: Cluster, part: Evaluation) -> tuple[np.ndarray, Volumes]:
-    done = cast(jax.Array, part.status).is_ready
+    done = cast(Any, part.status).is_ready
     while not done():
         time.sleep(POLL)
     cluster.look()
