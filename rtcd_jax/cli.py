@@ -63,6 +63,20 @@ def certify(arguments: Sequence[str]) -> int:
     return OK if whole else BROKEN_PROMISE
 
 
+def export(arguments: Sequence[str]) -> int:
+    """write the controller, its funnel monitor and the design of an elite for a lab"""
+    from rtcd_jax.options import read_export
+
+    options = read_export(arguments)
+    _prepare_jax()
+    from rtcd_jax.console import Console
+    from rtcd_jax.export import export_run
+
+    with Console() as console:
+        export_run(options.run, options.elite, options.to, console)
+    return OK
+
+
 def check(arguments: Sequence[str]) -> int:
     """check a certificate file by exact arithmetic, without any solver"""
     from rtcd_jax.certificate.check import main as check_main
@@ -74,6 +88,7 @@ VERBS: dict[str, Callable[[Sequence[str]], int]] = {
     "optimize": optimize,
     "verify": verify,
     "certify": certify,
+    "export": export,
     "check": check,
 }
 

@@ -60,6 +60,20 @@ class CertifyOptions:
     workers: Annotated[int, tyro.conf.arg(help="processes, one elite each [-] (>= 1)")] = 2
 
 
+@dataclass(frozen=True)
+class ExportOptions:
+    """Write an elite for a lab: controller and funnel monitor in Python and C, tables, MJCF and URDF.
+
+    Example: rtcd export checkpoints/pendulum_rtcd --to lab/pendulum
+    """
+
+    run: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RUN", help="the run folder")]
+    to: Annotated[Path, tyro.conf.arg(metavar="DIR", help="a new or empty folder, or a former export, to replace it")]
+    elite: Annotated[
+        int | Literal["initial"], tyro.conf.arg(metavar="K", help="0 is the best [-] (>= 0); or initial")
+    ] = 0
+
+
 def read_optimize(arguments: Sequence[str], runs: Path) -> tuple[Config, Path]:
     """The configuration with its overrides, and the run folder.
 
@@ -94,6 +108,16 @@ def read_certify(arguments: Sequence[str]) -> CertifyOptions:
     for name in ("elites", "workers"):
         if getattr(options, name) < 1:
             raise UserError(f"--{name} = {getattr(options, name)}: must be >= 1")
+    if not options.run.is_dir():
+        raise UserError(f"{options.run}: no such run folder; `{OPTIMIZE_USAGE}` makes one")
+    return options
+
+
+def read_export(arguments: Sequence[str]) -> ExportOptions:
+    """The checked options of `rtcd export`; `UserError` if one is out of range."""
+    options = tyro.cli(ExportOptions, args=arguments, prog="rtcd export", use_underscores=True)
+    if isinstance(options.elite, int) and options.elite < 0:
+        raise UserError(f"--elite = {options.elite}: must be >= 0, or initial")
     if not options.run.is_dir():
         raise UserError(f"{options.run}: no such run folder; `{OPTIMIZE_USAGE}` makes one")
     return options

@@ -108,6 +108,10 @@ WRONG = {
     "no run": (["verify", "no/such/run"], "no/such/run: no such run folder"),
     "no states": (["verify", "configs", "--states", "0"], "--states = 0: must be >= 1"),
     "negative seed": (["verify", "configs", "--seed", "-1"], "--seed = -1: must be >= 0"),
+    "no run to export": (["export", "no/such/run", "--to", "x"], "no/such/run: no such run folder"),
+    "negative elite": (["export", "configs", "--to", "x", "--elite", "-1"], "--elite = -1: must be >= 0, or initial"),
+    "no such elite's name": (["export", "configs", "--to", "x", "--elite", "best"], "--elite"),
+    "nowhere to export to": (["export", "configs"], "--to"),
     "misspelt verify option": (["verify", "configs", "--sed", "1"], "--seed"),
 }
 

@@ -24,6 +24,7 @@ LAYERS = (
     {"search"},
     {"storage"},
     {"verify", "options", "certificate", "report"},
+    {"export"},
     {"run"},
     {"cli"},
 )
@@ -38,7 +39,7 @@ OWNERS = {
     "evosax": {"cmaes"},
     "rich": {"console", "verify", "certificate", "report"},
     "tyro": {"options"},
-    "yaml": {"config"},
+    "yaml": {"config", "export"},
     "matplotlib": {"report"},
     "pydantic": {"settings", "config", "options"},
     "pydantic_core": {"settings"},
