@@ -50,6 +50,45 @@ def verify(arguments: Sequence[str]) -> int:
     return OK if held else BROKEN_PROMISE
 
 
+def report(arguments: Sequence[str]) -> int:
+    """write a run's figures and its page, or compare several runs on one"""
+    from rtcd_jax.options import read_report
+
+    options = read_report(arguments)
+    from rtcd_jax.report import report as write_report
+
+    page, *figures = write_report(options.runs, options.to)
+    print(f"{page}, and {len(figures)} figures in {figures[0].parent}")
+    return OK
+
+
+def animate(arguments: Sequence[str]) -> int:
+    """show the swing-up of a run's initial and best candidate as MP4 and GIF"""
+    from rtcd_jax.options import read_animate
+
+    options = read_animate(arguments)
+    _prepare_jax()
+    from rtcd_jax.console import Console
+    from rtcd_jax.report.animate import animate_run
+
+    with Console() as console:
+        animate_run(options.run, options.to, options.seed, console)
+    return OK
+
+
+def replay(arguments: Sequence[str]) -> int:
+    """say whether a measured motion stayed inside a run's funnel"""
+    from rtcd_jax.options import read_replay
+
+    options = read_replay(arguments)
+    from rtcd_jax.console import Console
+    from rtcd_jax.report.replay import replay_run
+
+    with Console() as console:
+        kept = replay_run(options.run, options.file, options.elite, console)
+    return OK if kept else BROKEN_PROMISE
+
+
 def certify(arguments: Sequence[str]) -> int:
     """prove the funnels of a run's elites by sums of squares"""
     from rtcd_jax.options import read_certify
@@ -87,6 +126,9 @@ def check(arguments: Sequence[str]) -> int:
 VERBS: dict[str, Callable[[Sequence[str]], int]] = {
     "optimize": optimize,
     "verify": verify,
+    "report": report,
+    "animate": animate,
+    "replay": replay,
     "certify": certify,
     "export": export,
     "check": check,

@@ -46,6 +46,45 @@ class VerifyOptions:
 
 
 @dataclass(frozen=True)
+class ReportOptions:
+    """Write a finished run's page, report.html, and its figures; several runs are compared on one page.
+
+    Example: rtcd report checkpoints/pendulum_rtc checkpoints/pendulum_rtcd --to comparison.html
+    """
+
+    runs: Annotated[
+        tyro.conf.Positional[tuple[Path, ...]], tyro.conf.arg(metavar="RUN [RUN …]", help="the run folders")
+    ]
+    to: Annotated[Path | None, tyro.conf.arg(metavar="FILE", help="the page; by default in or beside the run")] = None
+
+
+@dataclass(frozen=True)
+class AnimateOptions:
+    """Show the swing-up by MuJoCo's renderer as MP4 and GIF: initial beside best, undisturbed and disturbed.
+
+    Needs no display: it draws by EGL or OSMesa. Example: rtcd animate checkpoints/pendulum_rtcd --to videos
+    """
+
+    run: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RUN", help="the run folder")]
+    to: Annotated[Path | None, tyro.conf.arg(metavar="DIR", help="for the videos; by default animation/ in RUN")] = None
+    seed: Annotated[int, tyro.conf.arg(help="of the disturbed start, from the first ellipsoid [-] (>= 0)")] = 0
+
+
+@dataclass(frozen=True)
+class ReplayOptions:
+    """Was a measured run inside the funnel? V/rho of every sample; exit code 1 if it left.
+
+    FILE has the columns time,pos,vel,torque or time,pos1,pos2,vel1,vel2,tau1,tau2 in SI units, the time from the start
+    of the swing-up. Errors of angles are not wrapped: unwrap the encoder first.
+    Example: rtcd replay checkpoints/pendulum_rtcd measured.csv --elite 0
+    """
+
+    run: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RUN", help="the run folder")]
+    file: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="FILE", help="the measured states, a CSV file")]
+    elite: Annotated[int, tyro.conf.arg(metavar="K", help="whose funnel; 0 is the best [-] (>= 0)")] = 0
+
+
+@dataclass(frozen=True)
 class CertifyOptions:
     """Prove the funnels of a run's best elites by sums of squares; `rtcd check` checks what this writes.
 
@@ -97,8 +136,35 @@ def read_verify(arguments: Sequence[str]) -> VerifyOptions:
         raise UserError(f"--states = {options.states}: must be >= 1")
     if options.seed < 0:
         raise UserError(f"--seed = {options.seed}: must be >= 0")
-    if not options.run.is_dir():
-        raise UserError(f"{options.run}: no such run folder; `{OPTIMIZE_USAGE}` makes one")
+    _require_run(options.run)
+    return options
+
+
+def read_report(arguments: Sequence[str]) -> ReportOptions:
+    """The checked options of `rtcd report`; `UserError` if a run is missing."""
+    options = tyro.cli(ReportOptions, args=arguments, prog="rtcd report", use_underscores=True)
+    if not options.runs:
+        raise UserError("which run? rtcd report RUN [RUN …] [--to FILE]")
+    for run in options.runs:
+        _require_run(run)
+    return options
+
+
+def read_animate(arguments: Sequence[str]) -> AnimateOptions:
+    """The checked options of `rtcd animate`; `UserError` if one is out of range."""
+    options = tyro.cli(AnimateOptions, args=arguments, prog="rtcd animate", use_underscores=True)
+    if options.seed < 0:
+        raise UserError(f"--seed = {options.seed}: must be >= 0")
+    _require_run(options.run)
+    return options
+
+
+def read_replay(arguments: Sequence[str]) -> ReplayOptions:
+    """The checked options of `rtcd replay`; `UserError` if one is out of range."""
+    options = tyro.cli(ReplayOptions, args=arguments, prog="rtcd replay", use_underscores=True)
+    if options.elite < 0:
+        raise UserError(f"--elite = {options.elite}: must be >= 0")
+    _require_run(options.run)
     return options
 
 
@@ -108,8 +174,7 @@ def read_certify(arguments: Sequence[str]) -> CertifyOptions:
     for name in ("elites", "workers"):
         if getattr(options, name) < 1:
             raise UserError(f"--{name} = {getattr(options, name)}: must be >= 1")
-    if not options.run.is_dir():
-        raise UserError(f"{options.run}: no such run folder; `{OPTIMIZE_USAGE}` makes one")
+    _require_run(options.run)
     return options
 
 
@@ -118,9 +183,13 @@ def read_export(arguments: Sequence[str]) -> ExportOptions:
     options = tyro.cli(ExportOptions, args=arguments, prog="rtcd export", use_underscores=True)
     if isinstance(options.elite, int) and options.elite < 0:
         raise UserError(f"--elite = {options.elite}: must be >= 0, or initial")
-    if not options.run.is_dir():
-        raise UserError(f"{options.run}: no such run folder; `{OPTIMIZE_USAGE}` makes one")
+    _require_run(options.run)
     return options
+
+
+def _require_run(folder: Path) -> None:
+    if not folder.is_dir():
+        raise UserError(f"{folder}: no such run folder; `{OPTIMIZE_USAGE}` makes one")
 
 
 def _parse(arguments: Sequence[str], defaults: OptimizeOptions) -> OptimizeOptions:

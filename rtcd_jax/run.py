@@ -17,7 +17,7 @@ from rtcd_jax.errors import UserError
 from rtcd_jax.evaluation import Evaluate, elite_effort, make_evaluate, resample, spread
 from rtcd_jax.population import initial_genome
 from rtcd_jax.problem import Problem, make_problem
-from rtcd_jax.report import draw_convergence, draw_funnels
+from rtcd_jax.report import report
 from rtcd_jax.results import arrays_of, record_of
 from rtcd_jax.storage import RunFolder, elite_names
 from rtcd_jax.types import Evaluation, Status
@@ -134,10 +134,21 @@ def _finish(
     best_first = [_row(finished.evaluation, k) for k in range(int(finished.count))]
     run.write_initial(arrays_of(problem, initial), record_of(problem, effort, initial))
     run.write_elites((arrays_of(problem, found), record_of(problem, effort, found)) for found in best_first)
-    pictures = [*draw_funnels(run.path), *draw_convergence(run.path)]
+    run.tell_time()
     for line in _summary(problem, initial, best_first[0]):
         console.message(line)
-    console.message(f"{len(best_first)} elites and {len(pictures)} figures in {run.path}")
+    console.message(f"{len(best_first)} elites in {run.path}")
+    _report(run.path, console)
+
+
+def _report(folder: Path, console: Console) -> None:
+    """The run's page and figures. The run is whole without them: what goes wrong here is told, and ends nothing."""
+    try:
+        page, *figures = report([folder])
+    except Exception as error:
+        console.message(f"the run is finished, but its report failed: {error!r}; `rtcd report {folder}` makes it")
+    else:
+        console.message(f"{page}, and {len(figures)} figures in {figures[0].parent}")
 
 
 def _row(evaluation: Evaluation, index: int) -> Evaluation:

@@ -2,7 +2,7 @@
 
     format.json                the mark of a run folder and its format's version
     config.yaml                the resolved configuration
-    provenance.json            versions, device and commit of every start of the run
+    provenance.json            versions, device, commit and working time of every start of the run
     generations.jsonl          one line a generation, flushed at once
     state/                     checkpoints of the search, the latest two
     initial.npz, initial.json  the configuration's initial candidate
@@ -55,7 +55,7 @@ class RunFolder:
         self._seconds = seconds
         self._checkpointer = checkpointer
         self._held = held
-        self._saved = time.monotonic()
+        self._begun = self._saved = time.monotonic()
 
     @classmethod
     def open(cls, path: Path, config: Config) -> Self:
@@ -128,7 +128,15 @@ class RunFolder:
             # tensorstore tells of a full disk by ValueError.
             with writing(self._state_path, (OSError, ValueError)):
                 self._checkpointer.save(generation, state, force=True)
+        self.tell_time()
         self._saved = time.monotonic()
+
+    def tell_time(self) -> None:
+        """Notes in provenance.json how long this start has worked [s]; a kill leaves what the latest save noted."""
+        file = self.path / "provenance.json"
+        told = json.loads(file.read_text(encoding="utf-8"))
+        told["starts"][-1]["seconds"] = round(time.monotonic() - self._begun, 1)
+        replace_json(file, told)
 
     def write_initial(self, arrays: Arrays, record: Record) -> None:
         """The configuration's initial candidate, in the elites' format."""

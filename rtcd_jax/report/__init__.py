@@ -1,5 +1,13 @@
-"""Run folder -> figures. Reads what a run has stored, computes nothing anew, and needs no JAX."""
+"""Run folder -> figures, tables, one HTML page. Reads what a run has stored, and needs no JAX.
 
-from rtcd_jax.report.figures import draw_convergence, draw_funnels
+reading.py, history.py     the folder's content, and the course of its search
+funnels.py, progress.py    figures/NAME.png and .pdf
+plots.py, tables.py        what the page shows
+page.py                    report.html
+tube.py, replay.py         was a measured motion inside the funnel?
+render.py, animate.py      the swing-up before MuJoCo's camera
+"""
 
-__all__ = ["draw_convergence", "draw_funnels"]
+from rtcd_jax.report.page import report
+
+__all__ = ["report"]

@@ -1,0 +1,220 @@
+"""`rtcd report`: one HTML page that needs nothing but itself, and the same figures for print.
+
+plotly.js, the data, style and script stand in the page, whose security policy forbids every request. Tables sort by
+a click on a heading.
+"""
+
+import base64
+import html
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+from rtcd_jax.errors import UserError
+from rtcd_jax.files import replace
+from rtcd_jax.report import tables
+from rtcd_jax.report.funnels import draw_funnels, draw_levels, draw_over
+from rtcd_jax.report.plots import plots
+from rtcd_jax.report.progress import draw_convergence, draw_courses
+from rtcd_jax.report.reading import Experiment, Run, compared, read_run
+from rtcd_jax.report.tables import Cell, Table
+from rtcd_jax.report.words import NONE, duration, listed, ratio, rung, words
+
+POLICY = "default-src 'none'; script-src 'unsafe-inline'; style-src 'unsafe-inline'; img-src data: blob:"
+"""What the browser may do: run and show what is in the page."""
+
+
+def report(folders: Sequence[Path], to: Path | None = None) -> list[Path]:
+    """Writes the page of a finished run, or one that compares several, and its figures; the page's path first.
+
+    One run: `report.html` and `figures/` in its folder. Several: `comparison.html` beside the first folder, with
+    `comparison.png` and `.pdf`. `to` is another path for the page.
+
+    Raises:
+        UserError: a folder that is no finished run's, runs of different robots, or a path that cannot be written.
+    """
+    runs = [read_run(folder) for folder in folders]
+    if to is not None and to.is_dir():
+        raise UserError(f"--to = {to}: must be a file, and this is a folder")
+    if len(runs) == 1:
+        page, drawn = to or folders[0] / "report.html", draw_figures(runs[0])
+    else:
+        runs = compared(runs)
+        page = to or folders[0].resolve().parent / "comparison.html"
+        drawn = draw_over(runs, page.parent, page.stem)
+    replace(page, render(runs).encode())
+    return [page, *drawn]
+
+
+def draw_figures(run: Run) -> list[Path]:
+    """The figures of one run as `figures/NAME.png` and `.pdf`. Raises UserError if they cannot be written."""
+    return [path for draw in (draw_funnels, draw_levels, draw_courses, draw_convergence) for path in draw(run)]
+
+
+def render(runs: Sequence[Run]) -> str:
+    """The whole page."""
+    title = html.escape(" and ".join(run.name for run in runs))
+    figures = plots(runs)
+    data = json.dumps(figures, allow_nan=False, separators=(",", ":")).replace("<", "\\u003c")
+    body = "\n".join([_header(runs), *_sections(runs, figures)])
+    return (
+        f'<!doctype html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n<title>{title}</title>\n'
+        f'<meta name="viewport" content="width=device-width, initial-scale=1">\n'
+        f'<meta http-equiv="Content-Security-Policy" content="{POLICY}">\n<link rel="icon" href="data:,">\n'
+        f"<style>\n{_asset('page.css')}</style>\n<script>{_plotly()}</script>\n</head>\n<body>\n<main>\n{body}\n</main>\n"
+        f'<script type="application/json" id="figures">{data}</script>\n<script>\n{_asset("page.js")}</script>\n'
+        "</body>\n</html>\n"
+    )
+
+
+def _header(runs: Sequence[Run]) -> str:
+    first = runs[0].config
+    about = f"{first.plant.name}, {first.trajectory.knots} knots"
+    if len(runs) == 1:
+        search = first.search
+        about += f"; {search.mode} search for the largest {words(search.objective)}, "
+        about += f"{search.generations} generations of {search.population}"
+        cards = "".join(_card(*card) for card in _headlines(runs[0]))
+        told = f'<p class="candidate">{_candidate(runs[0])}</p>'
+    else:
+        cards = "".join(
+            _card(run.name, f"× {_told(_gain(run, 'sum'))}", f"sum over its initial one, {run.best.record['rung']}")
+            for run in runs
+        )
+        told = ""
+    names = " · ".join(html.escape(run.name) for run in runs)
+    head = f'<h1>{names}</h1><p class="about">{html.escape(about)}</p>'
+    return f'<header>{head}{told}<div class="cards">{cards}</div></header>'
+
+
+def _candidate(run: Run) -> str:
+    record = run.best.record
+    design = [listed(name, value, run.config.plant.design[name]) for name, value in record["design"].items()]
+    weights = [listed(name, value) for name, value in record["weights"].items()]
+    return html.escape("best: " + ", ".join([*design, *weights]))
+
+
+def _headlines(run: Run) -> Iterator[tuple[str, str, str]]:
+    """Name, value and remark of what is looked for first."""
+    objective = run.config.search.objective
+    for name in dict.fromkeys((objective, "sum", "inlet")):
+        searched = ", searched" if name == objective else ""
+        yield f"{words(name)} over initial", f"× {_told(_gain(run, name))}", run.best.record["rung"] + searched
+    yield "swing-up", duration(float(run.best.time[-1])), "of the best, start to goal"
+    found = run.certificates.get("000")
+    yield "proof", found["rung"] if found else "none yet", "of the best's funnel" if found else "rtcd certify"
+    kept = [seen.get("kept") for seen in run.verification.values()]
+    seen = ("promises kept" if all(kept) else "PROMISE BROKEN") if kept else "none yet"
+    yield "verification", seen, "by independent simulators" if kept else "rtcd verify"
+
+
+def _gain(run: Run, volume: str) -> float | None:
+    return ratio(run.best.volumes[volume], run.initial.volumes[volume]) if run.initial else None
+
+
+def _card(name: str, value: str, remark: str) -> str:
+    parts = (("span", name), ("strong", value), ("small", remark))
+    return f'<div class="card">{"".join(f"<{tag}>{html.escape(text)}</{tag}>" for tag, text in parts)}</div>'
+
+
+def _sections(runs: Sequence[Run], figures: Mapping[str, Any]) -> Iterator[str]:
+    alone = runs[0] if len(runs) == 1 else None
+    if alone is None:
+        yield _section("Compared", _table(tables.comparison(runs)))
+    yield _section("Funnels", *_funnels(runs, figures))
+    promise = "" if alone is None else _note(f"The best funnel is {rung(alone.best.record)}.")
+    told = "Ratios are optimal over initial. The sum counts knots, most of them near the goal: look at the inlet too."
+    yield _section("Initial and optimal", _table(tables.gains(runs)), promise, _note(told))
+    if alone:
+        named = [name for name in figures if name.startswith("course")]
+        boxes = "".join(_plot(name, "small") for name in named)
+        yield _section("Search", _plot("convergence", "tall"), _note("Volumes are sampled, as the search saw them."))
+        yield _section("Design and weights", f'<div class="grid">{boxes}</div>')
+        yield _section("Elites", _table(tables.elites(alone)), _note("Click a heading to sort."))
+    else:
+        yield _section("Search", _plot("convergence"))
+    yield _section("Certificates", *_certified(runs))
+    seen = tables.verification(runs)
+    yield _section("Verification", _table(seen) if seen else _note("Nothing yet: rtcd verify RUN."))
+    for run in runs:
+        for found in run.experiments:
+            name = words(found.name) if alone else f"{words(found.name)}: {run.name}"
+            yield _section(f"Disturbance: {name}", _table(tables.experiment(found)), *_pictures(found))
+    yield _section("Provenance", _table(tables.provenance(runs)))
+
+
+def _funnels(runs: Sequence[Run], figures: Mapping[str, Any]) -> Iterator[str]:
+    for run in runs:
+        if run.absence:
+            yield _note(f"{run.name}: {run.absence}" if len(runs) > 1 else f"{run.absence}.")
+    yield (
+        '<label class="moment">ellipsoid at <output>0.00 s</output>'
+        '<input type="range" min="0" max="1" step="0.002" value="0" aria-label="time along the motion"></label>'
+    )
+    named = [name for name in figures if name.startswith("plane")]
+    yield f'<div class="grid wide">{"".join(_plot(name) for name in named)}</div>'
+    yield _note(
+        "Shadows of every knot's ellipsoid on the plane of a coordinate and its velocity. A click in the legend hides."
+    )
+    yield _plot("levels")
+
+
+def _certified(runs: Sequence[Run]) -> Iterator[str]:
+    found = tables.certificates(runs)
+    if found is None:
+        yield _note("Nothing yet: rtcd certify RUN.")
+        return
+    yield _table(found)
+    for run in runs:
+        ranks = tables.ranks(run)
+        if ranks:
+            whose = f"{run.name}: " if len(runs) > 1 else ""
+            told = f"rank correlation of sampled and shown sums over {ranks[1]} elites: {ranks[0]:.3f}"
+            yield _note(whose + told)
+
+
+def _pictures(found: Experiment) -> Iterator[str]:
+    for path in found.pictures:
+        data = base64.b64encode(path.read_bytes()).decode()
+        yield f'<img src="data:image/png;base64,{data}" alt="{html.escape(words(path.stem))}">'
+
+
+def _section(title: str, *parts: str) -> str:
+    return f"<section><h2>{html.escape(title)}</h2>\n{''.join(parts)}\n</section>"
+
+
+def _plot(name: str, size: str = "") -> str:
+    return f'<div class="plot {size}" data-figure="{name}"></div>'
+
+
+def _note(text: str) -> str:
+    return f'<p class="note">{html.escape(text)}</p>'
+
+
+def _table(table: Table) -> str:
+    heads = "".join(f'<th scope="col"><button type="button">{html.escape(head)}</button></th>' for head in table.heads)
+    rows = "\n".join(f"<tr>{''.join(map(_cell, row))}</tr>" for row in table.rows)
+    return f'<div class="scroll"><table>\n<thead><tr>{heads}</tr></thead>\n<tbody>\n{rows}\n</tbody></table></div>'
+
+
+def _cell(value: Cell) -> str:
+    if isinstance(value, str):
+        return f"<td>{html.escape(value)}</td>"
+    sorted_by = "" if value is None else f' data-value="{value!r}"'
+    return f'<td class="number"{sorted_by}>{_told(value)}</td>'
+
+
+def _told(value: float | int | None) -> str:
+    return NONE if value is None else f"{value}" if isinstance(value, int) else f"{value:.4g}"
+
+
+def _asset(name: str) -> str:
+    return resources.files("rtcd_jax.report").joinpath(name).read_text(encoding="utf-8")
+
+
+def _plotly() -> str:
+    """plotly.js, as its Python package brings it; only the file is read, which saves the import's second."""
+    code = resources.files("plotly").joinpath("package_data/plotly.min.js").read_text(encoding="utf-8")
+    return code.replace("</script", "<\\/script")

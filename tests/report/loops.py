@@ -1,0 +1,32 @@
+"""Run folders with a real closed loop: a motion into the upright, its LQR, and a level, for both robots."""
+
+import numpy as np
+
+from rtcd_jax import config as configuration
+from rtcd_jax.storage import RunFolder
+from tests.certificate import balance, swing
+from tests.report.runs import experiment
+
+LOOPS = {"pendulum": swing, "cartpole": balance}
+PROMISE = {
+    "status": "OK", "rung": "sampled", "epsilon": 0.01, "confidence": 0.99, "design": {}, "weights": {},
+    "config_hash": "0" * 12,
+}  # fmt: skip
+
+
+def stored(plant):
+    """Arrays and record of an elite."""
+    arrays, record = LOOPS[plant].elite()
+    volumes = {f"volumes_{name}": np.array(1.0) for name in ("sum", "integral", "inlet", "geometric_mean")}
+    return arrays | volumes, record | PROMISE
+
+
+def loop_folder(path, plant, initial=None):
+    """A run folder whose elite 000 is such a loop, the initial candidate too unless `initial` says otherwise."""
+    arrays, record = stored(plant)
+    task = {"start": arrays["x"][0].tolist(), "goal": arrays["x_goal"].tolist()}
+    config: configuration.Config = experiment(plant, task=task)
+    with RunFolder.open(path, config) as folder:
+        folder.write_elites([(arrays, record)])
+        folder.write_initial(arrays, record | (initial or {}))
+    return path
