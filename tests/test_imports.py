@@ -24,7 +24,7 @@ LAYERS = (
     {"search"},
     {"storage"},
     {"verify", "options", "certificate", "report"},
-    {"export"},
+    {"export", "disturb"},
     {"run"},
     {"cli"},
 )

@@ -13,10 +13,10 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from rtcd_jax.errors import UserError
-from rtcd_jax.numerics.hermite import cubic_hermite
 from rtcd_jax.plants import plant_class
 from rtcd_jax.plants.base import Plant
 from rtcd_jax.plants.mjx import CpuDynamics, model_of
+from rtcd_jax.report.tube import Tube
 from rtcd_jax.storage import read_elite
 from rtcd_jax.verify.elite import Elite
 from rtcd_jax.verify.simulate import fastest_rate
@@ -24,63 +24,58 @@ from rtcd_jax.verify.simulate import fastest_rate
 HOLD = 0.1
 """Longest time for which the input may be held, in time constants of the loop's fastest mode."""
 RULE = f"the input is held for at most {HOLD:g} time constants of the loop's fastest mode"
+BETWEEN_KNOTS = "V = (x - x*)'S(t)(x - x*), S cubic Hermite, log rho linear; what was sampled is promised at knots"
 RATES = 50.0
 """Control rates are multiples of this [Hz]."""
 
 
 class Instant(NamedTuple):
-    """The loop at one time: x* [n], u* [m], K [m n], and E [n n] with {e : e' E^-1 e <= 1} the funnel's section."""
+    """The loop at one time: x* [n], u* [m], K [m n], S [n n] and rho []."""
 
     x: np.ndarray
     u: np.ndarray
     gain: np.ndarray
-    shape: np.ndarray
+    value: np.ndarray
+    level: float
 
 
 @final
 @dataclass(frozen=True, eq=False)
 class Bundle:
-    """An elite with the slopes of x*(t), the robot that it is for, and MuJoCo's model of it.
+    """An elite with its funnel at every instant, the robot that it is for, and MuJoCo's model of it.
 
-    `rates` [N 2 n] are x*' at both ends of every interval; `joints` [m] says which joint an input drives.
+    `joints` [m] says which joint an input drives; `volumes` [knots] are the ellipsoids'.
     """
 
     name: str
-    elite: Elite
+    tube: Tube
     record: Mapping[str, Any]
     certificate: Mapping[str, Any] | None
     plant: Plant
     design: Any
     model: Any
-    rates: Float[np.ndarray, "N 2 n"]
     volumes: Float[np.ndarray, " knots"]
     joints: Int[np.ndarray, " m"]
 
     @property
-    def shapes(self) -> Float[np.ndarray, "knots n n"]:
-        """E_k = rho_k S_k^-1: the ellipsoids are {e : e' E_k^-1 e <= 1}."""
-        return self.elite.rho[:, None, None] * np.linalg.inv(self.elite.S)
+    def elite(self) -> Elite:
+        return self.tube.elite
 
     def at(self, t: float) -> Instant:
-        """The loop at a time t >= 0, x* by cubic Hermite interpolation, K and E linear; the goal's from t_N on.
-
-        Of the shapes that could be interpolated, E = rho S^-1 follows the motions: a state on the boundary at a knot
-        stays within 2 % of it until the next one, where a linear S would call it outside by up to a factor of 3.
-        """
-        elite, dt, shapes = self.elite, self.elite.time[1], self.shapes
+        """The loop at a time t >= 0: u* held, K linear, x*, S and rho as in `report.tube`; the goal's from t_N on."""
+        elite, dt, now = self.elite, self.elite.time[1], np.array([t])
+        x, value, level = self.tube.nominal(now)[0], self.tube.value(now)[0], float(self.tube.level(now)[0])
         if t >= elite.time[-1]:
-            return Instant(elite.x_goal, np.zeros_like(elite.u_max), elite.K_goal, shapes[-1])
+            return Instant(x, np.zeros_like(elite.u_max), elite.K_goal, value, level)
         k = min(int(t / dt), len(elite.u) - 1)
         s = t / dt - k
-        x = cubic_hermite(s, dt, elite.x[k], self.rates[k, 0], elite.x[k + 1], self.rates[k, 1])
-        gain, shape = ((1 - s) * a[k] + s * a[k + 1] for a in (elite.K, shapes))
-        return Instant(x, elite.u[k], gain, shape)
+        return Instant(x, elite.u[k], (1 - s) * elite.K[k] + s * elite.K[k + 1], value, level)
 
     def arrays(self) -> dict[str, np.ndarray]:
         """What `controller.npz` holds, SI units."""
         elite = self.elite
         kept = {name: getattr(elite, name) for name in ("time", "x", "u", "K", "S", "rho", "K_goal", "x_goal", "u_max")}
-        more = {"x_rates": self.rates, "E": self.shapes, "state_limits": elite.state_limits}
+        more = {"x_rates": self.tube.rates, "S_rates": self.tube.slopes, "state_limits": elite.state_limits}
         return kept | more | {"input_joints": self.joints}
 
     def describe(self) -> dict[str, Any]:
@@ -110,7 +105,7 @@ class Bundle:
                 "confidence": elite.confidence,
                 "volumes": record["volumes"],
                 "volume_unit": record["units"]["volume"],
-                "between_knots": "(x - x*)' E(t)^-1 (x - x*) <= 1, E linear between rho_k S_k^-1; promised at knots",
+                "between_knots": BETWEEN_KNOTS,
             },
             "certificate": self.certificate,
         }
@@ -125,24 +120,21 @@ def read_bundle(folder: Path, name: str) -> Bundle:
     arrays, record = read_elite(folder if name == "initial" else folder / "elites", name)
     if record.get("status") != "OK":
         raise UserError(f"{name} has no funnel to export ({record.get('status')}); choose another elite")
-    elite = Elite.of(arrays, record)
+    tube = Tube.of(arrays, record)
+    elite = tube.elite
     with jax.enable_x64(True):
         plant, design = plant_class(elite.plant).from_parameters(elite.parameters)
-        rate = jax.vmap(lambda x, u: plant.dynamics(design, x, u))
-        rates = np.stack([np.asarray(rate(ends, elite.u)) for ends in (elite.x[:-1], elite.x[1:])], axis=1)
     model = model_of(elite.plant, elite.parameters)
-    joints = model.actuator_trnid[:, 0].copy()
     return Bundle(
-        name,
-        elite,
-        record,
-        _certificate(folder, name, elite),
-        plant,
-        design,
-        model,
-        rates,
-        arrays["volumes_per_knot"],
-        joints,
+        name=name,
+        tube=tube,
+        record=record,
+        certificate=_certificate(folder, name, elite),
+        plant=plant,
+        design=design,
+        model=model,
+        volumes=arrays["volumes_per_knot"],
+        joints=model.actuator_trnid[:, 0].copy(),
     )
 
 

@@ -39,10 +39,12 @@ def data_header(bundle: Bundle) -> str:
     elite = bundle.elite
     arrays = {
         "X": elite.x,
-        "X_RATES": bundle.rates,
+        "X_RATES": bundle.tube.rates,
         "U": elite.u,
         "K": elite.K,
-        "E": bundle.shapes,
+        "S": elite.S,
+        "S_RATES": bundle.tube.slopes,
+        "LOG_RHO": np.log(elite.rho),
         "K_GOAL": elite.K_goal,
         "X_GOAL": elite.x_goal,
         "U_MAX": elite.u_max,

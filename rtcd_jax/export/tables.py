@@ -53,7 +53,8 @@ def vectors(bundle: Bundle) -> str:
         now = bundle.at(t)
         direction = random.normal(size=n)
         reach = FARTHEST * random.uniform()
-        error = np.linalg.cholesky(now.shape) @ (reach * direction / np.linalg.norm(direction))
+        axes = np.sqrt(now.level) * np.linalg.inv(np.linalg.cholesky(now.value)).T
+        error = axes @ (reach * direction / np.linalg.norm(direction))
         u = np.clip(now.u - now.gain @ error, -elite.u_max, elite.u_max)
         rows.append([t, *(now.x + error), *u, reach**2])
     header = ["time", *(f"x{i + 1}" for i in range(n)), *(f"u{j + 1}" for j in range(m)), "V_over_rho"]

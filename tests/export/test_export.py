@@ -1,7 +1,6 @@
 """An export is whole, says what it is, replaces nothing but a former one, and refuses with one clear line."""
 
 import csv
-import dataclasses
 import hashlib
 import json
 
@@ -13,7 +12,6 @@ from rtcd_jax.errors import UserError
 from rtcd_jax.export import export_run
 from rtcd_jax.export.bundle import read_bundle
 from rtcd_jax.storage import read_elite
-from rtcd_jax.verify.simulate import runge_kutta, tracking
 from tests.certificate import swing
 from tests.export.conftest import Silent
 from tests.export.folders import run_folder
@@ -206,24 +204,3 @@ def test_a_damaged_certificate_is_named(run, tmp_path):
     (run / "certificates" / "000.json").write_text("{")
     with pytest.raises(UserError, match=r"cannot read .*000.json.*prove it again by `rtcd certify"):
         export_run(run, 0, tmp_path / "lab", Silent())
-
-
-def test_between_knots_the_funnel_follows_the_motions(run):
-    """Boundaries of small ellipsoids, which the unsaturated loop carries into the next: 2 % over at most in between."""
-    bundle = read_bundle(run, "000")
-    elite = dataclasses.replace(bundle.elite, rho=np.full_like(bundle.elite.rho, 0.05))
-    bundle = dataclasses.replace(bundle, elite=elite)
-
-    def f(x, u):
-        return swing.rate(x.T, u[:, 0]).T
-
-    turns = np.linspace(0, 2 * np.pi, 40)
-    steps = 50
-    for k in range(len(elite.u)):
-        start, end = elite.time[k : k + 2]
-        x = elite.x[k] + np.stack([np.cos(turns), np.sin(turns)], axis=1) @ np.linalg.cholesky(bundle.shapes[k]).T
-        motion = runge_kutta(f, (end - start) / steps)(tracking(elite, f, k), start, end, x)
-        for step, x in enumerate(motion, start=1):
-            now = bundle.at(start + min(step / steps, 1 - 1e-9) * (end - start))
-            error = x - now.x
-            assert np.max(np.einsum("si,ij,sj->s", error, np.linalg.inv(now.shape), error)) < 1.02

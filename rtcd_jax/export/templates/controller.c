@@ -1,7 +1,7 @@
 /* On [t_k, t_k+1], with s = (t - t_k) / dt: u = clip(u_k - K(t) (x - x*(t))), x* the cubic Hermite interpolant of x_k
  * and its rates, K linear between K_k and K_k+1; before t_0 the first instant is held; from t_N on
- * u = clip(-K_goal (x - x_goal)). The funnel is {x : (x - x*)' E(t)^-1 (x - x*) <= 1}, E linear between
- * rho_k S_k^-1 and rho_k+1 S_k+1^-1. */
+ * u = clip(-K_goal (x - x_goal)). The funnel is {x : V = (x - x*)' S(t) (x - x*) <= rho(t)}, S the cubic Hermite
+ * interpolant of S_k and its rates, log rho linear. */
 #include "controller.h"
 
 #include <math.h>
@@ -25,16 +25,19 @@ static int place(double t, double *s)
     return k;
 }
 
-static void nominal_at(int k, double s, double x[N])
+static double cubic(double s, double start, double start_rate, double end, double end_rate)
 {
     const double r = 1.0 - s;
-    for (int i = 0; i < N; i++) {
-        if (k == INTERVALS)
-            x[i] = RTCD_X_GOAL[i];
-        else
-            x[i] = r * r * ((1.0 + 2.0 * s) * RTCD_X[k][i] + s * RTCD_DT * RTCD_X_RATES[k][0][i])
-                 + s * s * ((3.0 - 2.0 * s) * RTCD_X[k + 1][i] - r * RTCD_DT * RTCD_X_RATES[k][1][i]);
-    }
+    return r * r * ((1.0 + 2.0 * s) * start + s * RTCD_DT * start_rate)
+         + s * s * ((3.0 - 2.0 * s) * end - r * RTCD_DT * end_rate);
+}
+
+static void nominal_at(int k, double s, double x[N])
+{
+    for (int i = 0; i < N; i++)
+        x[i] = k == INTERVALS
+             ? RTCD_X_GOAL[i]
+             : cubic(s, RTCD_X[k][i], RTCD_X_RATES[k][0][i], RTCD_X[k + 1][i], RTCD_X_RATES[k][1][i]);
 }
 
 static int finite_all(double t, const double x[N])
@@ -73,24 +76,12 @@ void rtcd_control(double t, const double x[RTCD_STATES], double u[RTCD_INPUTS])
     }
 }
 
-/* e' E^-1 e = |y|^2 with L y = e and E = L L'; E is overwritten by L. */
-static double quadratic(double shape[N][N], const double e[N])
+/* S(t), entry by entry. */
+static double value_at(int k, double s, int i, int j)
 {
-    double y[N], sum = 0.0;
-    for (int i = 0; i < N; i++) {
-        y[i] = e[i];
-        for (int j = 0; j <= i; j++) {
-            double value = shape[i][j];
-            for (int l = 0; l < j; l++)
-                value -= shape[i][l] * shape[j][l];
-            shape[i][j] = i == j ? sqrt(value) : value / shape[j][j];
-            if (j < i)
-                y[i] -= shape[i][j] * y[j];
-        }
-        y[i] /= shape[i][i];
-        sum += y[i] * y[i];
-    }
-    return sum;
+    return k == INTERVALS
+         ? RTCD_S[k][i][j]
+         : cubic(s, RTCD_S[k][i][j], RTCD_S_RATES[k][0][i][j], RTCD_S[k + 1][i][j], RTCD_S_RATES[k][1][i][j]);
 }
 
 rtcd_monitor rtcd_watch(double t, const double x[RTCD_STATES], double abort_ratio)
@@ -98,18 +89,17 @@ rtcd_monitor rtcd_watch(double t, const double x[RTCD_STATES], double abort_rati
     rtcd_monitor now = {HUGE_VAL, -HUGE_VAL, 0, 1};
     if (!finite_all(t, x))
         return now;
-    double s, nominal[N], e[N], shape[N][N];
+    double s, nominal[N], value = 0.0;
     const int k = place(t, &s);
     const int next = k == INTERVALS ? k : k + 1;
     int outside = 0;
     nominal_at(k, s, nominal);
     for (int i = 0; i < N; i++) {
-        e[i] = x[i] - nominal[i];
         outside = outside || fabs(x[i]) > RTCD_STATE_LIMITS[i];
         for (int j = 0; j < N; j++)
-            shape[i][j] = (1.0 - s) * RTCD_E[k][i][j] + s * RTCD_E[next][i][j];
+            value += (x[i] - nominal[i]) * value_at(k, s, i, j) * (x[j] - nominal[j]);
     }
-    now.ratio = quadratic(shape, e);
+    now.ratio = fmax(value, 0.0) * exp(-((1.0 - s) * RTCD_LOG_RHO[k] + s * RTCD_LOG_RHO[next]));
     now.margin = 1.0 - sqrt(now.ratio);
     now.inside = now.ratio <= 1.0 && !outside;
     now.abort_advised = now.ratio > abort_ratio || outside;

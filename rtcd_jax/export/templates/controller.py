@@ -9,9 +9,11 @@ Time counts from the start of the motion. Angles are not wrapped. `controller.js
 
 On [t_k, t_k+1], with s = (t - t_k) / dt:  u = clip(u_k - K(t) (x - x*(t))), x* the cubic Hermite interpolant of x_k and
 its rates, K linear between K_k and K_k+1. Before t_0 the first instant is held; from t_N on u = clip(-K_goal (x -
-x_goal)). The funnel is {x : (x - x*)' E(t)^-1 (x - x*) <= 1}, E linear between rho_k S_k^-1 and rho_k+1 S_k+1^-1.
+x_goal)). The funnel is {x : V = (x - x*)'S(t)(x - x*) <= rho(t)}, S the cubic Hermite interpolant of S_k and its rates,
+log rho linear.
 """
 
+import math
 import sys
 from pathlib import Path
 from typing import NamedTuple
@@ -44,19 +46,25 @@ class Controller:
 
     def __init__(self, folder: Path | str = Path(__file__).parent, abort_ratio: float = 4.0):
         with np.load(Path(folder) / "controller.npz") as stored:
-            time, x, rates, self.u, gains, shapes = (stored[key] for key in ("time", "x", "x_rates", "u", "K", "E"))
+            time, x, rates, self.u, gains = (stored[key] for key in ("time", "x", "x_rates", "u", "K"))
+            values, value_rates, levels = stored["S"], stored["S_rates"], stored["rho"]
             self.x_goal, self.goal_gain = stored["x_goal"], stored["K_goal"]
             self.u_max, self.limits, self.joints = stored["u_max"], stored["state_limits"], stored["input_joints"]
         self.abort_ratio = abort_ratio
         self.dt, self.duration = float(time[1]), float(time[-1])
         self._rest = np.zeros_like(self.u_max)
-        self._shapes, self._growth, self._last_shape = shapes[:-1], np.diff(shapes, axis=0), shapes[-1]
-        # Coefficients of 1, s, s^2, s^3 for x*(t) and, behind it, K(t): one product looks both up.
-        start, end, first, last = x[:-1], x[1:], self.dt * rates[:, 0], self.dt * rates[:, 1]
-        cubic = [start, first, 3 * (end - start) - 2 * first - last, 2 * (start - end) + first + last]
+        self._log_levels, self._last_value = np.log(levels).tolist(), values[-1] / levels[-1]
+        # Coefficients of 1, s, s^2, s^3, one row an interval: of x*(t) with K(t) behind it, and of S(t).
         flat = gains.reshape(len(gains), -1)
-        linear = [flat[:-1], np.diff(flat, axis=0), 0 * flat[1:], 0 * flat[1:]]
-        self._table = np.concatenate([np.stack(cubic, 1), np.stack(linear, 1)], axis=2)
+        linear = np.stack([flat[:-1], np.diff(flat, axis=0), 0 * flat[1:], 0 * flat[1:]], axis=1)
+        self._table = np.concatenate([self._cubics(x, rates), linear], axis=2)
+        self._values = self._cubics(values.reshape(len(values), -1), value_rates.reshape(*value_rates.shape[:2], -1))
+
+    def _cubics(self, knots, rates) -> np.ndarray:
+        """Hermite's cubics [N 4 columns] through rows of `knots`, with `rates` at both ends of every interval."""
+        start, end, first, last = knots[:-1], knots[1:], self.dt * rates[:, 0], self.dt * rates[:, 1]
+        cubic = [start, first, 3 * (end - start) - 2 * first - last, 2 * (start - end) + first + last]
+        return np.stack(cubic, axis=1)
 
     def init(self, x0=None) -> None:
         """Nothing to do: the controller has no memory."""
@@ -90,14 +98,17 @@ class Controller:
             return Monitor(np.inf, -np.inf, False, True)
         k, s = self._place(t)
         if k is None:
-            nominal, shape = self.x_goal, self._last_shape
+            error = x - self.x_goal
+            ratio = float(error @ self._last_value @ error)
         else:
-            nominal = np.array([1.0, s, s * s, s * s * s]) @ self._table[k, :, : len(x)]
-            shape = self._shapes[k] + s * self._growth[k]
-        error = x - nominal
-        ratio = float(error @ np.linalg.solve(shape, error))
+            powers = np.array([1.0, s, s * s, s * s * s])
+            error = x - powers @ self._table[k, :, : len(x)]
+            value = (powers @ self._values[k]).reshape(len(x), len(x))
+            log_level = (1 - s) * self._log_levels[k] + s * self._log_levels[k + 1]
+            ratio = float(error @ value @ error) * math.exp(-log_level)
         outside = bool((np.abs(x) > self.limits).any())
-        return Monitor(ratio, 1 - ratio**0.5, ratio <= 1 and not outside, ratio > self.abort_ratio or outside)
+        ratio = max(ratio, 0.0)  # the rounding of a state on the nominal motion
+        return Monitor(ratio, 1 - math.sqrt(ratio), ratio <= 1 and not outside, ratio > self.abort_ratio or outside)
 
     def _place(self, t: float):
         """The interval and the fraction of it; None behind the last one."""
