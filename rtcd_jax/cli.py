@@ -116,6 +116,20 @@ def export(arguments: Sequence[str]) -> int:
     return OK
 
 
+def disturb(arguments: Sequence[str]) -> int:
+    """try a run's best elite and its initial candidate: off-nominal starts, pushes, wrong models, noise, delay"""
+    from rtcd_jax.options import read_disturb
+
+    options = read_disturb(arguments)
+    _prepare_jax()
+    from rtcd_jax.console import Console
+    from rtcd_jax.disturb import disturb_run
+
+    with Console() as console:
+        disturb_run(options.run, options.states, options.seed, console)
+    return OK
+
+
 def check(arguments: Sequence[str]) -> int:
     """check a certificate file by exact arithmetic, without any solver"""
     from rtcd_jax.certificate.check import main as check_main
@@ -130,6 +144,7 @@ VERBS: dict[str, Callable[[Sequence[str]], int]] = {
     "animate": animate,
     "replay": replay,
     "certify": certify,
+    "disturb": disturb,
     "export": export,
     "check": check,
 }

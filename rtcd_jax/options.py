@@ -100,6 +100,18 @@ class CertifyOptions:
 
 
 @dataclass(frozen=True)
+class DisturbOptions:
+    """Try the initial candidate and the best elite: off-nominal starts, pushes, wrong models, noise, delay.
+
+    Example: rtcd disturb checkpoints/pendulum_rtcd --states 1000
+    """
+
+    run: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RUN", help="the run folder")]
+    states: Annotated[int, tyro.conf.arg(help="uniform states of every first ellipsoid [-] (>= 1)")] = 1000
+    seed: Annotated[int, tyro.conf.arg(help="of states, noise and perturbations [-] (>= 0)")] = 0
+
+
+@dataclass(frozen=True)
 class ExportOptions:
     """Write an elite for a lab: controller and funnel monitor in Python and C, tables, MJCF and URDF.
 
@@ -174,6 +186,17 @@ def read_certify(arguments: Sequence[str]) -> CertifyOptions:
     for name in ("elites", "workers"):
         if getattr(options, name) < 1:
             raise UserError(f"--{name} = {getattr(options, name)}: must be >= 1")
+    _require_run(options.run)
+    return options
+
+
+def read_disturb(arguments: Sequence[str]) -> DisturbOptions:
+    """The checked options of `rtcd disturb`; `UserError` if one is out of range."""
+    options = tyro.cli(DisturbOptions, args=arguments, prog="rtcd disturb", use_underscores=True)
+    if options.states < 1:
+        raise UserError(f"--states = {options.states}: must be >= 1")
+    if options.seed < 0:
+        raise UserError(f"--seed = {options.seed}: must be >= 0")
     _require_run(options.run)
     return options
 
