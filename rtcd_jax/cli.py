@@ -1,6 +1,7 @@
 """The console script `rtcd`: one thin function for each verb.
 
-Exit codes: 0 done; 1 the result breaks its promise; 2 the input is wrong; 130 interrupted.
+Exit codes: 0 done; 1 the result breaks its promise; 2 the input is wrong; 75 another process of the run has ended;
+85 the system asked to stop, and the same command goes on; 130 interrupted.
 Nothing heavy is imported before the input is known to be right.
 """
 
@@ -8,10 +9,11 @@ import os
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import NoReturn
 
 from rtcd_jax.errors import UserError, closest
 
-OK, BROKEN_PROMISE, WRONG_INPUT, INTERRUPTED = 0, 1, 2, 130
+OK, BROKEN_PROMISE, WRONG_INPUT, LOST_PROCESS, PREEMPTED, INTERRUPTED = 0, 1, 2, 75, 85, 130
 RUNS = Path("checkpoints")
 
 CPU_FLAGS = (
@@ -26,14 +28,39 @@ def optimize(arguments: Sequence[str]) -> int:
     """search for the design and the weights with the largest funnel, or resume a search"""
     from rtcd_jax.options import read_optimize
 
-    config, folder = read_optimize(arguments, RUNS)
-    _prepare_jax()
-    from rtcd_jax.console import Console
+    config, options = read_optimize(arguments, RUNS)
+    _prepare_jax(options.cpu_devices)
+    from rtcd_jax.cluster import Cluster, Lost, Preempted, join, part
+
+    join(options.coordinator, options.num_processes, options.process_id)  # before any import that touches a device
+    from rtcd_jax.console import Console, silent
     from rtcd_jax.run import optimize as run_optimize
 
-    with Console() as console:
-        run_optimize(config, folder, console)
+    cluster = Cluster.of(options.devices)
+    cluster.heed()
+    with Console() if cluster.first else silent() as console:
+        try:
+            run_optimize(config, options.run, console, cluster)
+        except Preempted:
+            console.message(f"asked to stop (SIGTERM): saved in {options.run}; the same command goes on")
+            part()
+            _leave(PREEMPTED)
+        except Lost as error:
+            print(f"rtcd: {error}; start all of them again by the same command, to go on", file=sys.stderr)
+            _leave(LOST_PROCESS)
+        except UserError as error:
+            if cluster.processes == 1:
+                raise
+            print(f"rtcd: {error}", file=sys.stderr)
+            _leave(WRONG_INPUT)
     return OK
+
+
+def _leave(code: int) -> NoReturn:
+    """Ends this process without waiting for what its devices still compute, or for other processes."""
+    sys.stdout.flush()
+    sys.stderr.flush()
+    os._exit(code)
 
 
 def verify(arguments: Sequence[str]) -> int:
@@ -137,6 +164,35 @@ def check(arguments: Sequence[str]) -> int:
     return check_main(arguments)
 
 
+def falsify(arguments: Sequence[str]) -> int:
+    """simulate a great many motions of what a certificate says is proved"""
+    from rtcd_jax.options import read_falsify
+
+    options = read_falsify(arguments)
+    from rtcd_jax.certificate.falsify import falsify_file
+    from rtcd_jax.console import Console
+
+    with Console() as console:
+        held = falsify_file(options.certificate, options.rollouts, options.seed, options.workers, console)
+    return OK if held else BROKEN_PROMISE
+
+
+def audit(arguments: Sequence[str]) -> int:
+    """show where a funnel from outside fails, and mend its nominal for a proof"""
+    from rtcd_jax.options import read_audit
+
+    options = read_audit(arguments)
+    from rtcd_jax.certificate.audit import audit as run_audit
+    from rtcd_jax.certificate.outside import Cost, read_outside
+    from rtcd_jax.console import Console
+
+    given = read_outside(options.file, options.plant, options.numbers)
+    cost = Cost.of(given, options.q, options.r, options.state_limits)
+    with Console() as console:
+        held = run_audit(given, cost, options.states, options.seed, options.out, console)
+    return OK if held else BROKEN_PROMISE
+
+
 VERBS: dict[str, Callable[[Sequence[str]], int]] = {
     "optimize": optimize,
     "verify": verify,
@@ -147,6 +203,8 @@ VERBS: dict[str, Callable[[Sequence[str]], int]] = {
     "disturb": disturb,
     "export": export,
     "check": check,
+    "falsify": falsify,
+    "audit": audit,
 }
 
 
@@ -192,17 +250,17 @@ def _version() -> str:
     return f"rtcd {version('rtcd-jax')}"
 
 
-def _prepare_jax() -> None:
-    """Double precision, one CPU device for each core that this process may use, and its full vector width."""
+def _prepare_jax(cpu_devices: int | None = None) -> None:
+    """Double precision; XLA's options for the CPU; that many CPU devices, or one for each core this process may use."""
     flags = os.environ.get("XLA_FLAGS", "")
     ours = (flag for flag in CPU_FLAGS if flag.split("=")[0] not in flags)
     os.environ["XLA_FLAGS"] = " ".join([flags, *ours]).strip()
     import jax
 
     jax.config.update("jax_enable_x64", True)
-    by_flag = "host_platform_device_count" in flags
-    if not by_flag and "JAX_NUM_CPU_DEVICES" not in os.environ:
-        jax.config.update("jax_num_cpu_devices", _cores())
+    by_environment = "host_platform_device_count" in flags or "JAX_NUM_CPU_DEVICES" in os.environ
+    if cpu_devices or not by_environment:
+        jax.config.update("jax_num_cpu_devices", cpu_devices or _cores())
 
 
 def _cores() -> int:

@@ -159,17 +159,54 @@ class TrajectoryConfig(Settings):
     )
 
 
+def _searchable(must: str, holds: Callable[[float], bool]) -> PlainValidator:
+    """Of a number that stays, or of a variable that the search moves."""
+
+    def read(data: Any) -> float | Variable:
+        if isinstance(data, Mapping | Variable):
+            variable = Variable.model_validate(data)
+            ends = ((end, getattr(variable, end)) for end in ("min", "max"))
+            wrong = [Problem((end,), f"must be {must}", value) for end, value in ends if not holds(value)]
+            if wrong:
+                raise invalid(wrong)
+            return variable
+        if isinstance(data, bool) or not isinstance(data, int | float):
+            keys = ", ".join(Variable.model_fields)
+            raise invalid([Problem((), f"must be a number, or a mapping with the keys {keys}", data)])
+        if not holds(data):
+            raise invalid([Problem((), f"must be {must}", data)])
+        return float(data)
+
+    return PlainValidator(read)
+
+
+Searchable = SerializeAsAny[float | Variable]
+Authority = Annotated[Searchable, _searchable("> 0 and <= 1", lambda a: 0 < a <= 1)]
+Discount = Annotated[Searchable, _searchable(">= 0 and finite", lambda a: 0 <= a < float("inf"))]
+
+
 class PolicyConfig(Settings):
-    """What the tracking controller's Riccati equation changes of Q and R; the defaults are the paper's TVLQR."""
+    """What the tracking controller's Riccati equation changes of Q and R; the defaults are the paper's TVLQR.
+
+    `authority` and `discount` are numbers, or variables with their boxes: then the search chooses them, `authority` on
+    a log scale.
+    """
 
     input_weight: float = Field(default=1.0, gt=0, description="R of the controller over that of the trajectory [-]")
-    authority: float = Field(
+    authority: Authority = Field(
         default=1.0,
-        gt=0,
-        le=1,
-        description="R grows to R / max(1 - |u*| / u_max, authority)^2 where u* leaves little of the input [-]",
+        description="R grows to R / max(1 - |u*| / u_max, authority)^2 where u* leaves little of the input [-] "
+        "(> 0 and <= 1)",
     )
-    discount: float = Field(default=0.0, ge=0, description="alpha: V falls as if A were A + alpha I [1/s]")
+    discount: Discount = Field(default=0.0, description="alpha: V falls as if A were A + alpha I [1/s] (>= 0)")
+
+    def variables(self) -> dict[str, Variable]:
+        """Those of the options that are variables."""
+        return {name: option for name, option in self if isinstance(option, Variable)}
+
+    def initial(self) -> dict[str, float]:
+        """The options' numbers, a variable's initial one."""
+        return {name: option.initial if isinstance(option, Variable) else option for name, option in self}
 
 
 class GoalConfig(Settings):
@@ -228,7 +265,9 @@ class SearchConfig(Settings):
     )
     sigma: float = Field(default=0.3, gt=0, le=1, description="initial step size in the unit box [-]")
     seed: int = Field(default=0, ge=0, lt=2**32, description="of all random numbers [-]")
-    chunk: int = Field(default=32, ge=1, description="candidates solved together, which bounds the memory [-]")
+    chunk: int = Field(
+        default=64, ge=1, description="candidates that a device evaluates at once, which bounds its memory [-]"
+    )
     nested: NestedConfig = Field(
         default=NestedConfig(), description="budget of the two loops, used in mode nested alone"
     )
@@ -282,11 +321,11 @@ class Config(Settings):
         return _across_sections(dict(self))
 
     def variables(self) -> dict[str, Variable]:
-        """Every variable by its dotted key: the design in the plant's order, then q, then r."""
+        """Every variable by its dotted key: the design in the plant's order, then q, r, and the policy's."""
         found = {f"design.{name}": variable for name, variable in self.design.items()}
         for letter, variables in self.weights:
             found |= {f"weights.{letter}.{i}": variable for i, variable in enumerate(variables)}
-        return found
+        return found | {f"policy.{name}": variable for name, variable in self.policy.variables().items()}
 
 
 def _sizes(plant: PlantConfig, task: TaskConfig) -> Iterator[Problem]:
@@ -338,9 +377,11 @@ def _positive_weights(weights: WeightsConfig) -> Iterator[Problem]:
                 yield Problem(("weights", letter, i, "min"), "must be > 0: weights have a log scale", variable.min)
 
 
-def _something_free(design: dict[str, Variable], weights: WeightsConfig, search: SearchConfig) -> Iterator[Problem]:
+def _something_free(
+    design: dict[str, Variable], weights: WeightsConfig, policy: PolicyConfig, search: SearchConfig
+) -> Iterator[Problem]:
     designs = any(variable.free for variable in design.values())
-    tunable = any(variable.free for variable in (*weights.q, *weights.r))
+    tunable = any(variable.free for variable in (*weights.q, *weights.r, *policy.variables().values()))
     if not designs and not tunable:
         yield Problem((), "nothing to search: every variable is pinned or has min = max")
     elif search.mode == "nested" and not (designs and tunable):

@@ -1,14 +1,24 @@
-"""Progress of a search: a live line on a terminal, one plain line a generation elsewhere. Takes plain numbers."""
+"""Progress of long work: a live line on a terminal, plain lines elsewhere. Takes plain numbers."""
 
 import math
 import sys
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Self, TextIO
+from typing import Protocol, Self, TextIO
 
 from rich.console import Console as Terminal
 from rich.progress import BarColumn, TextColumn
 from rich.progress import Progress as Bar
+
+
+class Countable(Protocol):
+    """How far some work is: `done` of `total` parts, and `str` says the rest."""
+
+    @property
+    def done(self) -> int: ...
+
+    @property
+    def total(self) -> int: ...
 
 
 @dataclass(frozen=True)
@@ -29,6 +39,14 @@ class Progress:
     elapsed: float
     left: float
     failures: Mapping[str, int] = field(default_factory=dict)
+
+    @property
+    def done(self) -> int:
+        return self.generation
+
+    @property
+    def total(self) -> int:
+        return self.generations
 
     def __str__(self) -> str:
         parts = [
@@ -64,7 +82,7 @@ class Console:
         self._terminal.print(text, soft_wrap=True, highlight=False, markup=False, emoji=False)
         self._terminal.file.flush()
 
-    def progress(self, now: Progress) -> None:
+    def progress(self, now: Countable) -> None:
         """Redraws the live line on a terminal; prints a line elsewhere."""
         if not self._terminal.is_terminal:
             self.message(str(now))
@@ -72,9 +90,14 @@ class Console:
         if self._bar is None:
             columns = BarColumn(bar_width=16), TextColumn("{task.description}", markup=False)
             self._bar = Bar(*columns, console=self._terminal, auto_refresh=False)
-            self._bar.add_task("", total=now.generations)
+            self._bar.add_task("", total=now.total)
             self._bar.start()
-        self._bar.update(self._bar.task_ids[0], completed=now.generation, description=str(now), refresh=True)
+        self._bar.update(self._bar.task_ids[0], completed=now.done, description=str(now), refresh=True)
+
+
+def silent() -> Console:
+    """One that says nothing: for processes beside the first."""
+    return Console(terminal=Terminal(quiet=True))
 
 
 def _volume(value: float) -> str:

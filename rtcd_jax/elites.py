@@ -1,15 +1,32 @@
 """The archive: the best evaluations that a search has seen, no two of them closer than a distance."""
 
-from typing import final
+import functools
+from typing import Protocol, final
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, Int
 
 from rtcd_jax.types import Evaluation, Status, Volumes
 
 OBJECTIVES = {"sum": "total", "integral": "integral", "inlet": "inlet", "geometric_mean": "geometric_mean"}
+
+
+class Evaluated(Protocol):
+    """A population's evaluation, wherever its records are: an Evaluation, or one that is spread over devices."""
+
+    @property
+    def genome(self) -> Float[Array, "P d"]: ...
+    @property
+    def volumes(self) -> Volumes: ...
+    @property
+    def status(self) -> Int[Array, " P"]: ...
+
+    def take(self, rows: np.ndarray, /) -> Evaluation:
+        """The whole records of the candidates at `rows` [E]."""
+        ...
 
 
 @final
@@ -35,12 +52,12 @@ def volume(volumes: Volumes, objective: str) -> Float[Array, "*P"]:
     return getattr(volumes, OBJECTIVES[objective])
 
 
-def cost(evaluation: Evaluation, objective: str) -> Float[Array, "*P"]:
+def cost(evaluation: Evaluated, objective: str) -> Float[Array, "*P"]:
     """-log(volume), to be minimized, in float64; +inf for a candidate that has failed.
 
     The logarithm keeps the order, and makes the penalty at the box independent of the volume's unit.
     """
-    value = volume(evaluation.volumes, objective).astype(jnp.float64)
+    value = jnp.asarray(volume(evaluation.volumes, objective), jnp.float64)
     feasible = (evaluation.status == Status.OK) & jnp.isfinite(value) & (value > 0)
     return jnp.where(feasible, -jnp.log(jnp.where(feasible, value, 1.0)), jnp.inf)
 
@@ -58,29 +75,40 @@ def empty(capacity: int, example: Evaluation) -> Elites:
 
 
 def merge(
-    elites: Elites, evaluation: Evaluation, objective: str, generation: Int[Array, ""] | int, distance: float
+    elites: Elites, evaluation: Evaluated, objective: str, generation: Int[Array, "*E"] | int, distance: float
 ) -> Elites:
     """The best E of the elites and a population, failures left out: greedily the best, without its neighbors.
 
     Neighbors are closer than `distance` in every coordinate of the unit box (Chebyshev). Among equal costs the older
     elite stays. Whatever was dropped by an earlier merge is gone, so that the order of merges matters only where
-    evaluations are neighbors.
+    evaluations are neighbors. Works on the host: only the records of those that enter are asked for.
     """
+    capacity = elites.costs.shape[0]
     costs = jnp.concatenate([elites.costs, cost(evaluation, objective)])
-    genomes = jnp.concatenate([elites.evaluation.genome, evaluation.genome])
-    born = jnp.full(evaluation.status.shape, generation, jnp.int32)
+    genomes = jnp.concatenate([elites.evaluation.genome, jnp.asarray(evaluation.genome)])
+    chosen, kept = jax.device_get(_choose(costs, genomes, distance, capacity))
+    filled, enters = np.isfinite(kept), chosen >= capacity
+    stays = np.minimum(chosen, capacity - 1)
+    records = jax.tree.map(lambda leaf: np.asarray(leaf)[stays], elites.evaluation)
+    if np.any(filled & enters):
+        fresh = evaluation.take(np.where(filled & enters, chosen, chosen[filled & enters][0]) - capacity)
+        records = jax.tree.map(lambda new, old: np.where(_like(enters, new), new, old), fresh, records)
+    born = np.broadcast_to(np.asarray(generation, np.int32), evaluation.status.shape)
+    found = Elites(records, kept, np.concatenate([elites.generations, born])[chosen])
+    blank = empty(capacity, elites.evaluation)
+    return jax.tree.map(lambda new, old: jnp.asarray(np.where(_like(filled, new), new, old)), found, blank)
+
+
+@functools.partial(jax.jit, static_argnums=3)
+def _choose(costs: Float[Array, " K"], genomes: Float[Array, "K d"], distance: float, count: int):
+    """Places and costs of the best `count`, +inf from where nothing is left."""
 
     def choose(remaining, _):
         best = jnp.argmin(remaining)
         near = jnp.max(jnp.abs(genomes - genomes[best]), axis=-1) < distance
         return jnp.where(near, jnp.inf, remaining).at[best].set(jnp.inf), (best, remaining[best])
 
-    _, (chosen, kept) = jax.lax.scan(choose, costs, length=elites.costs.shape[0])
-    merged = jax.tree.map(lambda old, new: jnp.concatenate([old, new])[chosen], elites.evaluation, evaluation)
-    filled = jnp.isfinite(kept)
-    blank = empty(elites.costs.shape[0], evaluation)
-    found = Elites(merged, kept, jnp.concatenate([elites.generations, born])[chosen])
-    return jax.tree.map(lambda new, old: jnp.where(_like(filled, new), new, old), found, blank)
+    return jax.lax.scan(choose, costs, length=count)[1]
 
 
 def _like(mask, leaf):

@@ -8,9 +8,6 @@ from collections.abc import Callable
 from functools import partial
 
 import jax
-import jax.numpy as jnp
-import numpy as np
-from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec
 
 from rtcd_jax import rollout
 from rtcd_jax.confirmation import Dynamics, Effort
@@ -62,24 +59,6 @@ def make_evaluate(problem: Problem, effort: Effort | None = None) -> Evaluate:
         return jax.lax.map(assess, (genomes, candidates, trajectories), batch_size=chunk)
 
     return evaluate
-
-
-def spread(evaluate: Evaluate, devices: list[jax.Device]) -> Evaluate:
-    """The same evaluation, jitted, with the candidates shared out evenly over devices; the last ones are padded."""
-    mesh = Mesh(np.array(devices), ("candidates",), axis_types=(AxisType.Auto,))
-    split, whole = PartitionSpec("candidates"), PartitionSpec()
-    # Every device runs loops of its own length: there is nothing to keep in step.
-    shared = jax.jit(jax.shard_map(evaluate, mesh=mesh, in_specs=(split, whole), out_specs=split, check_vma=False))
-
-    def on_all(genomes, key) -> Evaluation:
-        count = genomes.shape[0]
-        padding = jnp.repeat(genomes[-1:], -count % len(devices), 0)
-        # Wherever they come from, placed alike: one program for all callers.
-        padded = jax.device_put(jnp.concatenate([genomes, padding]), NamedSharding(mesh, split))
-        evaluation = shared(padded, jax.device_put(key, NamedSharding(mesh, whole)))
-        return jax.tree.map(lambda leaf: leaf[:count], evaluation)
-
-    return on_all
 
 
 def resample(problem: Problem, effort: Effort, evaluation: Evaluation, key) -> Evaluation:

@@ -1,7 +1,7 @@
 """Command line → checked options, by tyro. Overrides are merged into the YAML's mapping and validated as one."""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal, cast
 
@@ -13,6 +13,8 @@ from rtcd_jax.config import EXAMPLE, UNIT, Config, Variable, load, parse, parse_
 from rtcd_jax.errors import UserError
 from rtcd_jax.settings import Settings, bounds
 
+_COORDINATOR = "where process 0 listens; srun and mpirun need none"
+POLICY_UNITS = {"authority": "-", "discount": "1/s"}
 OPTIMIZE_USAGE = "rtcd optimize CONFIG [--run FOLDER] [--KEY VALUE …]"
 
 
@@ -34,6 +36,11 @@ class OptimizeOptions:
     config: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="CONFIG", help="the experiment, a YAML file")]
     settings: Annotated[Branch, tyro.conf.arg(name="")]
     run: Annotated[Path, tyro.conf.arg(metavar="FOLDER", help="run folder, resumed if it is there")]
+    devices: Annotated[int | None, tyro.conf.arg(help="devices to use of those each process sees [-] (all)")] = None
+    cpu_devices: Annotated[int | None, tyro.conf.arg(help="parts the CPU is split into [-] (its cores)")] = None
+    coordinator: Annotated[str | None, tyro.conf.arg(metavar="HOST:PORT", help=_COORDINATOR)] = None
+    num_processes: Annotated[int | None, tyro.conf.arg(help="processes of this run [-] (known under srun)")] = None
+    process_id: Annotated[int | None, tyro.conf.arg(help="this one's number [-] (0 …, known under srun)")] = None
 
 
 @dataclass(frozen=True)
@@ -100,6 +107,58 @@ class CertifyOptions:
 
 
 @dataclass(frozen=True)
+class FalsifyOptions:
+    """Simulate motions from the boundary and the inside of what a certificate says is proved, at instants all over it.
+
+    Equations and integrator share nothing with the proof. Exit code 1 if a motion leaves the funnel, a limit or the
+    goal region, beyond the integrator's own error, which is measured.
+
+    example: rtcd falsify checkpoints/pendulum_rtcd/certificates/000.json --rollouts 100000
+    """
+
+    certificate: Annotated[
+        tyro.conf.Positional[Path], tyro.conf.arg(metavar="FILE", help="a certificate, or a run folder (its 000)")
+    ]
+    rollouts: Annotated[int, tyro.conf.arg(help="motions to simulate [-] (>= 1)")] = 1_000_000
+    seed: Annotated[int, tyro.conf.arg(help="of their starts [-] (>= 0)")] = 0
+    workers: Annotated[int, tyro.conf.arg(help="processes [-] (>= 1)")] = 2
+
+
+@dataclass(frozen=True)
+class AuditOptions:
+    """Simulate a funnel from outside, knot by knot, and mend its nominal motion so that one can be proved about it.
+
+    FILE is a table: after a row of headings one row a knot, with the time, the states, the input held until the next
+    knot, rho, and the upper triangle of S. The gains are R^-1 B'S. Exit code 1 if a state left the funnel.
+
+    example: rtcd audit funnel.csv --plant pendulum --parameters m=0.7 l=0.4 b=0.1 g=9.81 torque_limit=2.5
+    --q 10 1 --r 0.1 --out checkpoints/audit
+    """
+
+    file: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="FILE", help="the trajectory and its funnel")]
+    plant: Annotated[str, tyro.conf.arg(help="pendulum or cartpole")]
+    parameters: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME=VALUE …", help="its physical numbers [SI]")]
+    q: Annotated[tuple[float, ...], tyro.conf.arg(help="diagonal of the cost's Q [1/(s state's unit^2)]")]
+    r: Annotated[float, tyro.conf.arg(help="the cost's R [1/(s input's unit^2)]")]
+    out: Annotated[Path, tyro.conf.arg(metavar="FOLDER", help="where the audit and the elites are stored")]
+    state_limits: Annotated[tuple[float, ...], tyro.conf.arg(help="largest |x_i|, inf for none [state's unit]")] = ()
+    states: Annotated[int, tyro.conf.arg(help="fresh states of each ellipsoid [-] (>= 1)")] = 1000
+    seed: Annotated[int, tyro.conf.arg(help="of the states [-] (>= 0)")] = 0
+
+    @property
+    def numbers(self) -> dict[str, float]:
+        """The parameters by name; `UserError` for one that is not NAME=VALUE."""
+        found = {}
+        for text in self.parameters:
+            name, _, value = text.partition("=")
+            try:
+                found[name] = float(value)
+            except ValueError:
+                raise UserError(f"--parameters {text}: must be NAME=VALUE with a number") from None
+        return found
+
+
+@dataclass(frozen=True)
 class DisturbOptions:
     """Try the initial candidate and the best elite: off-nominal starts, pushes, wrong models, noise, delay.
 
@@ -125,8 +184,8 @@ class ExportOptions:
     ] = 0
 
 
-def read_optimize(arguments: Sequence[str], runs: Path) -> tuple[Config, Path]:
-    """The configuration with its overrides, and the run folder.
+def read_optimize(arguments: Sequence[str], runs: Path) -> tuple[Config, OptimizeOptions]:
+    """The configuration with its overrides, and the options beside it.
 
     Raises `UserError` for a wrong YAML or value; tyro itself exits with code 2 for an unknown option.
     """
@@ -138,7 +197,22 @@ def read_optimize(arguments: Sequence[str], runs: Path) -> tuple[Config, Path]:
     else:
         raise UserError(f"the configuration comes first, but found {arguments[0]!r}: {OPTIMIZE_USAGE}")
     options = _parse(arguments, OptimizeOptions(config=tyro.MISSING, settings=_config_branch(defaults), run=folder))
-    return parse(options.settings, f"{options.config} with the options given"), options.run
+    _require_processes(options)
+    return parse(options.settings, f"{options.config} with the options given"), options
+
+
+def _require_processes(options: OptimizeOptions) -> None:
+    """All of coordinator, number and id, or none of them."""
+    for name, smallest in (("devices", 1), ("cpu_devices", 1), ("num_processes", 1), ("process_id", 0)):
+        value = getattr(options, name)
+        if value is not None and value < smallest:
+            raise UserError(f"--{name} = {value}: must be >= {smallest}")
+    together = {name: getattr(options, name) for name in ("coordinator", "num_processes", "process_id")}
+    missing = [f"--{name}" for name, value in together.items() if value is None]
+    if 0 < len(missing) < len(together):
+        raise UserError(f"{', '.join(missing)}: must be given too; a process needs all of --{', --'.join(together)}")
+    if options.process_id is not None and options.process_id >= options.num_processes:
+        raise UserError(f"--process_id = {options.process_id}: must be < --num_processes = {options.num_processes}")
 
 
 def read_verify(arguments: Sequence[str]) -> VerifyOptions:
@@ -215,6 +289,26 @@ def _require_run(folder: Path) -> None:
         raise UserError(f"{folder}: no such run folder; `{OPTIMIZE_USAGE}` makes one")
 
 
+def read_audit(arguments: Sequence[str]) -> AuditOptions:
+    """The checked options of `rtcd audit`; `UserError` if one is out of range."""
+    options = tyro.cli(AuditOptions, args=arguments, prog="rtcd audit", use_underscores=True)
+    for name, least in (("states", 1), ("seed", 0)):
+        if getattr(options, name) < least:
+            raise UserError(f"--{name} = {getattr(options, name)}: must be >= {least}")
+    return options
+
+
+def read_falsify(arguments: Sequence[str]) -> FalsifyOptions:
+    """The checked options of `rtcd falsify`; `UserError` if one is out of range."""
+    options = tyro.cli(FalsifyOptions, args=arguments, prog="rtcd falsify", use_underscores=True)
+    for name, least in (("rollouts", 1), ("seed", 0), ("workers", 1)):
+        if getattr(options, name) < least:
+            raise UserError(f"--{name} = {getattr(options, name)}: must be >= {least}")
+    if options.certificate.is_dir():
+        return replace(options, certificate=options.certificate / "certificates" / "000.json")
+    return options
+
+
 def _parse(arguments: Sequence[str], defaults: OptimizeOptions) -> OptimizeOptions:
     registry = ConstructorRegistry()
     registry.struct_rule(_plain)
@@ -239,7 +333,12 @@ def _config_branch(config: Config) -> Branch:
     design = {name: _section(variable, plant.design[name]) for name, variable in config.design.items()}
     weights = {"q": _list(config.weights.q, plant.states), "r": _list(config.weights.r, plant.inputs)}
     task = _section(config.task, ", ".join(plant.states.values()))
-    return _section(config, branches={"task": task, "design": _group(design), "weights": _group(weights)})
+    searched = config.policy.variables()
+    policy = _section(
+        config.policy, branches={name: _section(option, POLICY_UNITS[name]) for name, option in searched.items()}
+    )
+    branches = {"task": task, "design": _group(design), "weights": _group(weights), "policy": policy}
+    return _section(config, branches=branches)
 
 
 def _list(weights: Sequence[Variable], units: Mapping[str, str]) -> Branch:
@@ -261,7 +360,8 @@ def _section(settings: Settings, unit: str = "", branches: Mapping[str, Branch] 
         if name in ready or isinstance(value, Settings):
             fields.append(StructFieldSpec(name, Branch, ready.get(name) or _section(value, unit), field.description))
         else:
-            fields.append(StructFieldSpec(name, cast(type, field.annotation), value, _help(field, unit)))
+            kind = float if isinstance(value, float) else cast(type, field.annotation)
+            fields.append(StructFieldSpec(name, kind, value, _help(field, unit)))
     return Branch(tuple(fields))
 
 

@@ -4,13 +4,13 @@ S solves -S' = A'S + S A - S B R^-1 B' S + Q backward along (x*, u*), from the v
 infinite-horizon LQR with the same Q and R; K = R^-1 B' S (paper, section II-C). The whole closed loop thereby has one
 value function that continues through t_N.
 
-The configuration's `policy` may make the controller leave authority: A becomes A + alpha I, and R becomes
-w R / max(1 - |u*| / u_max, authority)^2 with the interval's own u*. The defaults, alpha = 0 and w = authority = 1,
-change nothing.
+The policy options, the configuration's or the search's, may make the controller leave authority: A becomes A + alpha I,
+and R becomes w R / max(1 - |u*| / u_max, authority)^2 with the interval's own u*. The defaults, alpha = 0 and
+w = authority = 1, change nothing.
 """
 
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -97,29 +97,35 @@ def goal_value(problem: Problem, candidate: Candidate):
     """S [n n] of the goal's infinite-horizon LQR, and whether it exists."""
     goal = jnp.asarray(problem.goal, candidate.q.dtype)
     rest = jnp.zeros(problem.plant.m, goal.dtype)
-    a, b = _discounted(problem, *linearize(problem, candidate, goal, rest))
+    a, b = _discounted(problem, candidate, *linearize(problem, candidate, goal, rest))
     weights = input_weights(problem, candidate, rest)
     return riccati.infinite_horizon(a, _spread(b, weights), jnp.diag(candidate.q))
 
 
+def options(problem: Problem, candidate: Candidate) -> dict[str, Any]:
+    """The policy's options by name: the candidate's, or else the configuration's."""
+    chosen = {"authority": candidate.authority, "discount": candidate.discount}
+    return problem.config.policy.initial() | {name: value for name, value in chosen.items() if value is not None}
+
+
 def input_weights(problem: Problem, candidate: Candidate, us):
     """The diagonal of the controller's R [m ...] where the feed-forward is `us` [m ...]."""
-    policy, behind = problem.config.policy, (1,) * (us.ndim - 1)
+    policy, behind = options(problem, candidate), (1,) * (us.ndim - 1)
     limits = jnp.asarray(problem.input_limits, us.dtype).reshape(-1, *behind)
-    left = jnp.maximum(1 - jnp.abs(us) / limits, policy.authority)
-    return policy.input_weight * candidate.r.reshape(-1, *behind) / left**2
+    left = jnp.maximum(1 - jnp.abs(us) / limits, policy["authority"])
+    return policy["input_weight"] * candidate.r.reshape(-1, *behind) / left**2
 
 
 def _interval(problem: Problem, candidate: Candidate, xs, us, weights, duration) -> riccati.Interval:
-    a, b = _discounted(problem, *linearize(problem, candidate, xs, us))
+    a, b = _discounted(problem, candidate, *linearize(problem, candidate, xs, us))
     cost = jnp.broadcast_to(jnp.diag(candidate.q)[:, :, None, None], a.shape)
     return riccati.constant_interval(a, _spread(b, weights), cost, duration, DOUBLINGS)
 
 
-def _discounted(problem: Problem, a, b):
+def _discounted(problem: Problem, candidate: Candidate, a, b):
     """A + alpha I, and B."""
     identity = jnp.eye(a.shape[0], dtype=a.dtype).reshape(a.shape[0], -1, *(1,) * (a.ndim - 2))
-    return a + problem.config.policy.discount * identity, b
+    return a + options(problem, candidate)["discount"] * identity, b
 
 
 def _spread(b, weights):

@@ -1,6 +1,7 @@
 """Genome [d] in the unit box <-> Candidate: boxes, scaling, pinned variables.
 
-Designs are scaled linearly, weights logarithmically; pinned variables have no dimension.
+Designs and the policy's discount are scaled linearly, weights and the policy's authority logarithmically; pinned
+variables have no dimension.
 """
 
 from collections.abc import Sequence
@@ -16,19 +17,23 @@ from rtcd_jax.types import Candidate
 
 def decode(problem: Problem, genome: Float[Array, " d"]) -> Candidate:
     """The candidate that a genome stands for; entries outside [0, 1] leave the box."""
-    values, dimension = [], 0
+    values, dimension = {}, 0
     for variable in problem.variables:
         if variable.free:
-            values.append(_from_unit(variable, genome[dimension]))
+            values[variable.name] = _from_unit(variable, genome[dimension])
             dimension += 1
         else:
-            values.append(jnp.asarray(variable.initial, genome.dtype))
-    plant = problem.plant
-    designs = len(values) - plant.n - plant.m
+            values[variable.name] = jnp.asarray(variable.initial, genome.dtype)
+
+    def section(prefix: str) -> list[Array]:
+        return [value for name, value in values.items() if name.startswith(prefix)]
+
     return Candidate(
-        design=plant.Design(*values[:designs]),
-        q=jnp.stack(values[designs : designs + plant.n]),
-        r=jnp.stack(values[designs + plant.n :]),
+        design=problem.plant.Design(*section("design.")),
+        q=jnp.stack(section("weights.q.")),
+        r=jnp.stack(section("weights.r.")),
+        authority=values.get("policy.authority"),
+        discount=values.get("policy.discount"),
     )
 
 

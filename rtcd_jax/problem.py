@@ -22,12 +22,17 @@ class Variable:
     free: bool
     logarithmic: bool
 
+    @property
+    def design(self) -> bool:
+        """Whether it is a field of the robot."""
+        return self.name.startswith("design.")
+
 
 @dataclass(frozen=True, eq=False)
 class Problem:
     """The experiment with its robot. Arrays are numpy: they become constants of compiled programs.
 
-    `variables` are the design fields in the plant's order, then the diagonal of Q, then that of R.
+    `variables` are the design fields in the plant's order, then the diagonal of Q, that of R, and those of the policy.
     """
 
     config: Config
@@ -48,8 +53,8 @@ class Problem:
 
     @property
     def design_dims(self) -> tuple[bool, ...]:
-        """For every genome dimension, whether it is a design variable (else a weight)."""
-        return tuple(not variable.logarithmic for variable in self.free)
+        """For every genome dimension, whether it is a design variable (else one of the controller)."""
+        return tuple(variable.design for variable in self.free)
 
 
 def make_problem(config: Config) -> Problem:
@@ -81,13 +86,13 @@ def _variables(config: Config):
             low=variable.min,
             high=variable.max,
             free=variable.free,
-            logarithmic=key.startswith("weights."),
+            logarithmic=key.startswith("weights.") or key == "policy.authority",
         )
 
 
 def _check_equilibrium(problem: Problem) -> None:
     plant = problem.plant
-    values = [jnp.asarray(variable.initial) for variable in problem.variables if not variable.logarithmic]
+    values = [jnp.asarray(variable.initial) for variable in problem.variables if variable.design]
     design = plant.Design(*values)
     rate = np.asarray(jax.jit(plant.dynamics)(design, jnp.asarray(problem.goal), jnp.zeros(plant.m)))
     # A goal typed with 16 digits leaves the rounding of pi times the stiffness of the robot.

@@ -8,6 +8,7 @@ import numpy as np
 from rtcd_jax.config import config_hash
 from rtcd_jax.confirmation import Effort
 from rtcd_jax.numerics.proportion import failure_bound
+from rtcd_jax.policy import options
 from rtcd_jax.problem import Problem
 from rtcd_jax.types import Evaluation, Status
 
@@ -50,7 +51,7 @@ def record_of(problem: Problem, effort: Effort, evaluation: Evaluation) -> dict[
         "parameters": plant.parameters(design),
         "design": {name: float(getattr(design, name)) for name in plant.design_units},
         "weights": {"q": host.candidate.q, "r": host.candidate.r},
-        "policy": config.policy.model_dump(),
+        "policy": options(problem, host.candidate),
         "units": {
             "states": dict(zip(plant.state_names, plant.state_units, strict=True)),
             "inputs": dict(zip(plant.input_names, plant.input_units, strict=True)),

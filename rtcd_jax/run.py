@@ -1,9 +1,8 @@
 """A whole run: config -> search -> elites evaluated again -> run folder. Stops and resumes at any generation."""
 
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from functools import partial
 from pathlib import Path
 
 import jax
@@ -11,14 +10,17 @@ import jax.numpy as jnp
 import numpy as np
 
 from rtcd_jax import search
+from rtcd_jax.cluster import Cluster, Preempted
 from rtcd_jax.config import Config
 from rtcd_jax.console import Console, Progress
+from rtcd_jax.elites import Elites
 from rtcd_jax.errors import UserError
-from rtcd_jax.evaluation import Evaluate, elite_effort, make_evaluate, resample, spread
+from rtcd_jax.evaluation import elite_effort, make_evaluate, resample
 from rtcd_jax.population import initial_genome
 from rtcd_jax.problem import Problem, make_problem
 from rtcd_jax.report import report
 from rtcd_jax.results import arrays_of, record_of
+from rtcd_jax.spread import Spread, spread
 from rtcd_jax.storage import RunFolder, elite_names
 from rtcd_jax.types import Evaluation, Status
 
@@ -26,18 +28,20 @@ LAST_FILE = Path("figures") / "convergence.pdf"
 """Written when all else is."""
 
 
-def optimize(config: Config, folder: Path, console: Console) -> None:
+def optimize(config: Config, folder: Path, console: Console, cluster: Cluster) -> None:
     """Search as `config` says and leave everything in the run folder; goes on where an earlier call stopped.
 
     Raises:
         UserError: the folder belongs to something else, or nothing at all is feasible.
+        Preempted: the system asked to stop; the folder has all that was done.
     """
     problem = make_problem(config)
-    evaluate = spread(make_evaluate(problem), jax.devices())
+    chunk = min(config.search.chunk, -(-config.search.population // len(cluster.devices)))
+    evaluate = spread(make_evaluate(problem), cluster, chunk)
     plan = search.Plan(config.search, config.elites, tuple(initial_genome(problem).tolist()), problem.design_dims)
-    with RunFolder.open(folder, config) as run, ThreadPoolExecutor(1) as pool:
-        genomes = jnp.zeros((config.search.population, len(problem.free)))
-        example = jax.eval_shape(evaluate, genomes, jax.random.key(0))
+    genomes = jnp.zeros((config.search.population, len(problem.free)))
+    example = jax.eval_shape(make_evaluate(problem), genomes, jax.random.key(0))
+    with RunFolder.open(folder, config, cluster) as run:
         begun = run.restore(search.start(plan, example))
         done = int(begun.generation)
         if done == config.search.generations and (folder / LAST_FILE).is_file():
@@ -45,15 +49,21 @@ def optimize(config: Config, folder: Path, console: Console) -> None:
             return
         if done:
             console.message(f"{folder}: going on after generation {done}")
-        console.message(f"compiling the evaluation of {config.search.population} candidates on {_devices()}")
-        again = pool.submit(_compile_resample, problem, example)  # beside the evaluation's own compilation
+        console.message(f"compiling the evaluation of {config.search.population} candidates on {cluster}")
+        again = _Again(problem, cluster, example)
         state, clock = begun, _Clock(config.search.population)
-        for state, generation in search.run(plan, evaluate, begun):
-            run.append(vars(generation))
-            run.save_if_due(state, int(state.generation))
-            console.progress(_progress(config, generation, clock))
+        try:
+            for state, generation in search.run(plan, evaluate, begun):
+                run.append(vars(generation))
+                run.save_if_due(state, int(state.generation))
+                console.progress(_progress(config, generation, clock))
+        except Preempted:
+            run.save(state, int(state.generation))
+            raise
         run.save(state, int(state.generation))
-        _finish(problem, plan, evaluate, again, state, run, console)
+        found = again([*_filled(state.elites), _initial(problem, evaluate)], search.last_key(plan), console)
+        finished = search.finish(plan, state, _stacked(found[:-1], state.elites))
+        cluster.on_first(lambda: _store(problem, finished, found[-1], run, console))
 
 
 class _Clock:
@@ -69,11 +79,6 @@ class _Clock:
         self.ends.append(time.monotonic())
         start, count = (self.begun, 1) if len(self.ends) == 1 else (self.ends[0], len(self.ends) - 1)
         return self.ends[-1] - self.begun, count * self.population / (self.ends[-1] - start)
-
-
-def _devices() -> str:
-    devices = jax.devices()
-    return f"{len(devices)} {devices[0].device_kind} device{'s' if len(devices) > 1 else ''}"
 
 
 def _progress(config: Config, generation: search.Generation, clock: _Clock) -> Progress:
@@ -92,46 +97,71 @@ def _progress(config: Config, generation: search.Generation, clock: _Clock) -> P
     )
 
 
-def _compile_resample(problem: Problem, population: Evaluation) -> jax.stages.Compiled:
-    """`resample` with the elites' effort for one candidate of a `population` (arrays' shapes)."""
-    one = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape[1:], leaf.dtype), population)
-    return jax.jit(partial(resample, problem, elite_effort(problem))).lower(one, jax.random.key(0)).compile()
+class _Again:
+    """The elites' second evaluation, more thorough: one candidate on every device at a time.
+
+    Its program compiles from the start on, beside the evaluation's own.
+    """
+
+    def __init__(self, problem: Problem, cluster: Cluster, population: Evaluation):
+        self._cluster = cluster
+        pool = ThreadPoolExecutor(1)
+        self._program: Future[jax.stages.Compiled] = pool.submit(self._compile, problem, population)
+        pool.shutdown(wait=False)
+
+    def _compile(self, problem: Problem, population: Evaluation) -> jax.stages.Compiled:
+        def one(evaluation, key):
+            again = resample(problem, elite_effort(problem), _row(evaluation, 0), jax.random.wrap_key_data(key))
+            return jax.tree.map(lambda leaf: leaf[None], again)
+
+        blank = jax.tree.map(lambda leaf: np.zeros(leaf.shape[1:], leaf.dtype), population)
+        key = jax.random.key_data(jax.random.key(0))
+        evaluations, whole = self._split([blank] * len(self._cluster.devices)), self._cluster.replicated(key)
+        return self._cluster.shared(one).lower(evaluations, whole).compile()
+
+    def _split(self, evaluations: Sequence[Evaluation]) -> Evaluation:
+        return self._cluster.split(jax.tree.map(lambda *leaves: np.stack(leaves), *evaluations))
+
+    def __call__(self, evaluations: Sequence[Evaluation], key: jax.Array, console: Console) -> list[Evaluation]:
+        """Each with its funnel sampled again. Raises Preempted between two rounds."""
+        devices, whole = len(self._cluster.devices), self._cluster.replicated(jax.random.key_data(key))
+        found: list[Evaluation] = []
+        for begin in range(0, len(evaluations), devices):
+            self._cluster.look()
+            batch = [*evaluations[begin : begin + devices]]
+            batch += batch[-1:] * (devices - len(batch))
+            sampled = self._cluster.gathered(self._program.result()(self._split(batch), whole))
+            found += [_row(sampled, k) for k in range(devices)]
+            done = min(len(found), len(evaluations))
+            console.message(f"funnel sampled again: {done} of {len(evaluations)}")
+        return found[: len(evaluations)]
 
 
-def _finish(
-    problem: Problem,
-    plan: search.Plan,
-    evaluate: Evaluate,
-    again: Future[jax.stages.Compiled],
-    state: search.SearchState,
-    run: RunFolder,
-    console: Console,
-) -> None:
-    """Sample the funnels of the elites and the initial candidate again, more thoroughly, and store everything."""
-    effort = elite_effort(problem)
-    elites = jax.device_get(state.elites)
-    filled = int(elites.count)
-    first = jnp.tile(jnp.asarray(initial_genome(problem)), (plan.settings.population, 1))
+def _filled(elites: Elites) -> list[Evaluation]:
+    records = jax.device_get(elites.evaluation)
+    return [_row(records, k) for k in range(int(elites.count))]
 
-    def sampled(index: int, evaluation: Evaluation, key) -> Evaluation:
-        found = jax.device_get(again.result()(evaluation, key))
-        console.message(f"funnel sampled again: {index + 1} of {filled + 1}")
-        return found
 
-    def reevaluate(genomes, key) -> Evaluation:
-        found = [sampled(k, _row(elites.evaluation, k), key) for k in range(filled)]
-        found += [found[-1]] * (len(genomes) - filled)
-        return jax.tree.map(lambda *leaves: np.stack(leaves), *found)
+def _stacked(evaluations: Sequence[Evaluation], elites: Elites) -> Evaluation:
+    """As many records as the archive has slots; what stands in the empty ones does not matter."""
+    rows = [*evaluations, *evaluations[-1:] * (len(elites.costs) - len(evaluations))]
+    return jax.tree.map(lambda *leaves: np.stack(leaves), *rows)
 
-    finished = search.finish(plan, reevaluate, state)
-    evaluated = jax.device_get(evaluate(first, jax.random.key(0)))
-    initial = sampled(filled, _row(evaluated, 0), jax.random.key(plan.settings.seed))
-    if not int(finished.count):
+
+def _initial(problem: Problem, evaluate: Callable[..., Spread]) -> Evaluation:
+    genome = np.asarray(initial_genome(problem))
+    return _row(evaluate(genome[None], jax.random.key(0)).take(np.array([0])), 0)
+
+
+def _store(problem: Problem, elites: Elites, initial: Evaluation, run: RunFolder, console: Console) -> None:
+    """Elites, initial candidate and figures in the run folder, a summary on the console."""
+    best_first = _filled(elites)
+    if not best_first:
         raise UserError(
-            f"none of the {filled} elites kept a funnel under more samples: raise funnel.directions or funnel.trials, "
+            "none of the elites kept a funnel under more samples: raise funnel.directions or funnel.trials, "
             "so that the search is not misled by luck"
         )
-    best_first = [_row(finished.evaluation, k) for k in range(int(finished.count))]
+    effort = elite_effort(problem)
     run.write_initial(arrays_of(problem, initial), record_of(problem, effort, initial))
     run.write_elites((arrays_of(problem, found), record_of(problem, effort, found)) for found in best_first)
     run.tell_time()

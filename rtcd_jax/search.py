@@ -1,9 +1,10 @@
 """ask -> evaluate -> tell -> elites, one generation at a time; no files, no clock, no devices.
 
-The search sees its problem through two functions alone, both deterministic:
+The search sees its problem through one deterministic function alone:
 
-    evaluate(genomes [P, d], key) -> Evaluation     a population in the unit box, `key` its common random numbers
-    reevaluate(genomes [E, d], key) -> Evaluation   the elites once more, with more samples and fresh directions
+    evaluate(genomes [P, d], key) -> Evaluated      a population in the unit box, `key` its common random numbers
+
+At its end the elites are evaluated once more, with more samples and fresh directions; `finish` sorts them by that.
 
 All randomness of a generation is fold_in(key(seed), index): the same state always has the same next state.
 """
@@ -22,12 +23,12 @@ from jaxtyping import Array, Float, Int, Key
 from rtcd_jax import cmaes, elites
 from rtcd_jax.cmaes import Stop
 from rtcd_jax.config import ElitesConfig, SearchConfig
-from rtcd_jax.elites import Elites
+from rtcd_jax.elites import Elites, Evaluated
 from rtcd_jax.errors import UserError
 from rtcd_jax.loops import Joint, Nested, NestedState
 from rtcd_jax.types import Evaluation, Status
 
-Evaluate = Callable[[Float[Array, "P d"], Key[Array, ""]], Evaluation]
+Evaluate = Callable[[Float[Array, "P d"], Key[Array, ""]], Evaluated]
 
 # Generations after which a search without any feasible candidate is given up.
 PATIENCE = 10
@@ -131,7 +132,9 @@ def step(plan: Plan, evaluate: Evaluate, state: SearchState) -> tuple[SearchStat
     strategy, stops = _tell(plan, strategy, points, seen.costs, anew)
     after = SearchState(
         strategy=strategy,
-        elites=_unbound(_merge(plan, state.elites, evaluation, state.generation, plan.elites.distance)),
+        elites=elites.merge(
+            state.elites, evaluation, plan.settings.objective, int(state.generation), plan.elites.distance
+        ),
         generation=state.generation + 1,
         evaluations=state.evaluations + len(seen.costs),
         restarts=state.restarts + jnp.sum(stops != Stop.NONE, dtype=jnp.int32),
@@ -156,17 +159,21 @@ def run(plan: Plan, evaluate: Evaluate, state: SearchState) -> Iterator[tuple[Se
         yield state, generation
 
 
-def finish(plan: Plan, reevaluate: Evaluate, state: SearchState) -> Elites:
-    """The elites by their second evaluation, sorted anew; those that fail it are dropped.
+def last_key(plan: Plan) -> Key[Array, ""]:
+    """The random numbers of the elites' second evaluation."""
+    return _key(plan, plan.settings.generations)
+
+
+def finish(plan: Plan, state: SearchState, evaluation: Evaluation) -> Elites:
+    """The elites by their second `evaluation` [E], slot by slot, sorted anew; those that failed it are dropped.
 
     A sampled volume that won among thousands is likely to have been lucky: only the second one may be reported.
     """
     first = state.elites
-    evaluation = reevaluate(first.evaluation.genome, _key(plan, plan.settings.generations))
     status = jnp.where(jnp.isfinite(first.costs), evaluation.status, jnp.int32(Status.NOT_FINITE))
     evaluation = eqx.tree_at(lambda e: e.status, evaluation, status)
     none = elites.empty(plan.elites.count, evaluation)
-    return _merge(plan, none, evaluation, first.generations, 0.0)
+    return elites.merge(none, evaluation, plan.settings.objective, first.generations, 0.0)
 
 
 def _loop(plan: Plan) -> Joint | Nested:
@@ -198,19 +205,6 @@ def _tell(plan: Plan, strategy: cmaes.State | NestedState, points, costs: Float[
     return _loop(plan).tell(strategy, points, costs, key)
 
 
-@functools.partial(jax.jit, static_argnums=0)
-def _merge(
-    plan: Plan, archive: Elites, evaluation: Evaluation, generation: Int[Array, "*E"], distance: float
-) -> Elites:
-    return elites.merge(archive, evaluation, plan.settings.objective, generation, distance)
-
-
-def _unbound(tree):
-    """The same arrays, tied to no device. Where `evaluate` spreads its work, its results would drag the search along,
-    and a sum over several devices rounds otherwise than the one of a search that went on from a file."""
-    return jax.tree.map(jnp.asarray, jax.device_get(tree))
-
-
 @final
 class _Seen(NamedTuple):
     """The numbers of a population's evaluation that the search itself looks at, on the host."""
@@ -221,7 +215,7 @@ class _Seen(NamedTuple):
     volumes: dict[str, np.ndarray]
 
     @classmethod
-    def of(cls, evaluation: Evaluation, objective: str) -> Self:
+    def of(cls, evaluation: Evaluated, objective: str) -> Self:
         volumes = {name: elites.volume(evaluation.volumes, name) for name in elites.OBJECTIVES}
         costs = elites.cost(evaluation, objective)
         seen = jax.device_get(cls(evaluation.genome, evaluation.status, costs, volumes))

@@ -23,7 +23,7 @@ import time
 import zipfile
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
-from typing import Any, Self, TypeVar, final
+from typing import TYPE_CHECKING, Any, Self, TypeVar, final
 
 import numpy as np
 
@@ -32,6 +32,9 @@ from rtcd_jax.config import Config
 from rtcd_jax.errors import UserError
 from rtcd_jax.files import is_temporary, plain, replace, replace_json, sync, writing
 from rtcd_jax.provenance import provenance
+
+if TYPE_CHECKING:
+    from rtcd_jax.cluster import Cluster
 
 FORMAT = "rtcd_jax run"
 VERSION = 1
@@ -45,39 +48,38 @@ Record = Mapping[str, Any]
 
 @final
 class RunFolder:
-    """A run folder that this process alone may write. A context manager: leaving it frees the folder.
+    """A run folder that this run alone may write. A context manager: leaving it frees the folder.
 
+    All processes of a run open it and call its methods alike: process 0 writes, states are saved by all together.
     Every method raises UserError, naming the path, where the folder cannot be written.
     """
 
-    def __init__(self, path: Path, seconds: float, checkpointer: Any, held: contextlib.ExitStack):
+    def __init__(self, path: Path, seconds: float, cluster: "Cluster", checkpointer: Any, held: contextlib.ExitStack):
         self.path = path
         self._seconds = seconds
+        self._cluster = cluster
         self._checkpointer = checkpointer
         self._held = held
         self._begun = self._saved = time.monotonic()
 
     @classmethod
-    def open(cls, path: Path, config: Config) -> Self:
+    def open(cls, path: Path, config: Config, cluster: "Cluster | None" = None) -> Self:
         """The folder of a new run, or of the one that `config` began: then `restore` gives the state to go on from.
 
+        Without a `cluster` it is that of this process' devices.
+
         Raises UserError if the folder holds something else, a run of another configuration (every differing key with
-        both values) or of another format, or if another process works on it.
+        both values) or of another format, if another run works on it, or if the processes were not started alike.
         """
-        _require_run_or_nothing(path)
+        if cluster is None:
+            from rtcd_jax.cluster import Cluster
+
+            cluster = Cluster.of()
+        cluster.require_alike("configuration", configuration.config_hash(config))
         with contextlib.ExitStack() as stack:
-            with writing(path):
-                path.mkdir(parents=True, exist_ok=True)
-            stack.enter_context(_locked(path))
-            with writing(path):
-                for leftover in path.rglob(".*.tmp"):
-                    leftover.unlink()
-            _claim(path, config)
-            _add_start(path, config)
-            with writing(path):
-                (path / "generations.jsonl").touch()
+            cluster.on_first(lambda: stack.enter_context(_prepared(path, config)))
             checkpointer = stack.enter_context(_checkpoints(path / "state"))
-            return cls(path, config.checkpoint.seconds, checkpointer, stack.pop_all())
+            return cls(path, config.checkpoint.seconds, cluster, checkpointer, stack.pop_all())
 
     def __enter__(self) -> Self:
         return self
@@ -104,35 +106,41 @@ class RunFolder:
         has others, or if lines are missing.
         """
         latest = self._checkpointer.latest
-        self._cut(latest.step if latest else 0)
-        return _load(self._checkpointer, state) if latest else state
+        self._cluster.on_first(lambda: self._cut(latest.step if latest else 0))
+        return _load(self._checkpointer, self._cluster.replicated(state)) if latest else state
 
     def append(self, record: Record) -> None:
         """Adds a generation to generations.jsonl."""
         line = json.dumps(plain(record), allow_nan=False) + "\n"
+        self._cluster.on_first(lambda: self._append(line.encode()))
+
+    def _append(self, line: bytes) -> None:
         with writing(self._lines_path), self._lines_path.open("ab") as file:
-            file.write(line.encode())
+            file.write(line)
 
     def save_if_due(self, state: Any, generation: int) -> bool:
         """Saves if `checkpoint.seconds` have passed since the last save; says whether it did."""
-        due = time.monotonic() - self._saved >= self._seconds
+        due = bool(self._cluster.agreed(np.asarray(time.monotonic() - self._saved >= self._seconds)))
         if due:
             self.save(state, generation)
         return due
 
     def save(self, state: Any, generation: int) -> None:
         """Keeps the state after `generation` generations, all of them appended before; waits until it is on disk."""
-        sync(self._lines_path)
+        self._cluster.on_first(lambda: sync(self._lines_path))
         latest = self._checkpointer.latest
         if latest is None or latest.step != generation:
             # tensorstore tells of a full disk by ValueError.
             with writing(self._state_path, (OSError, ValueError)):
-                self._checkpointer.save(generation, state, force=True)
-        self.tell_time()
+                self._checkpointer.save(generation, self._cluster.replicated(state), force=True)
+        self._cluster.on_first(self.tell_time)
         self._saved = time.monotonic()
 
     def tell_time(self) -> None:
-        """Notes in provenance.json how long this start has worked [s]; a kill leaves what the latest save noted."""
+        """Notes in provenance.json how long this start has worked [s]; a kill leaves what the latest save noted.
+
+        For process 0.
+        """
         file = self.path / "provenance.json"
         told = json.loads(file.read_text(encoding="utf-8"))
         told["starts"][-1]["seconds"] = round(time.monotonic() - self._begun, 1)
@@ -224,6 +232,23 @@ def read_generations(path: Path) -> list[dict[str, Any]]:
     """The generations of a run, null for what was not finite; a torn last line is left out."""
     with (path / "generations.jsonl").open("rb") as file:
         return [json.loads(line) for line in file if line.endswith(b"\n")]
+
+
+@contextlib.contextmanager
+def _prepared(path: Path, config: Config) -> Iterator[None]:
+    """The folder, made or recognized, locked and clean."""
+    _require_run_or_nothing(path)
+    with writing(path):
+        path.mkdir(parents=True, exist_ok=True)
+    with _locked(path):
+        with writing(path):
+            for leftover in path.rglob(".*.tmp"):
+                leftover.unlink()
+        _claim(path, config)
+        _add_start(path, config)
+        with writing(path):
+            (path / "generations.jsonl").touch()
+        yield
 
 
 def _require_run_or_nothing(path: Path) -> None:
@@ -321,9 +346,10 @@ def _load(checkpointer: Any, state: State) -> State:
     try:
         loaded = checkpointer.load(latest.step, shapes)
     except (KeyError, ValueError, OSError) as error:
+        before = " or remove it, to go on from the state before it;" if len(checkpointer.checkpoints) > 1 else ""
         raise UserError(
-            f"{latest.path} is not a state of this search: another version or precision wrote it; go on with what "
-            "provenance.json names, or choose another folder"
+            f"{latest.path} is no state of this search: it is damaged, or another version or precision wrote it; "
+            f"go on with what provenance.json names,{before} or choose another folder"
         ) from error
-    # A loaded array is bound to its device; a fresh one moves to where the evaluations are.
-    return jax.tree.map(lambda x: jnp.asarray(np.asarray(x)), loaded)
+    # A loaded array is bound to its devices; a fresh one moves to where the evaluations are.
+    return jax.tree.map(lambda x: jnp.asarray(np.asarray(x.addressable_data(0))), loaded)

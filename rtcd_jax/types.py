@@ -7,6 +7,7 @@ binds `N` at the first annotation and can evaluate `N+1` only afterwards.
 import enum
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
@@ -43,11 +44,15 @@ def first_failure(*statuses: Int[Array, ""]) -> Int[Array, ""]:
 
 
 class Candidate(eqx.Module):
-    """What the search chooses: the robot's design and the diagonals of the cost weights Q and R."""
+    """What the search chooses: the robot's design, the diagonals of the cost weights Q and R, and what it is asked to
+    choose of the policy's options; None is the configuration's number.
+    """
 
     design: eqx.Module
     q: Float[Array, " n"]
     r: Float[Array, " m"]
+    authority: Float[Array, ""] | None = None
+    discount: Float[Array, ""] | None = None
 
 
 class Trajectory(eqx.Module):
@@ -109,3 +114,7 @@ class Evaluation(eqx.Module):
     funnel: Funnel
     volumes: Volumes
     status: Int[Array, ""]
+
+    def take(self, rows) -> "Evaluation":
+        """Of a population's evaluation: the candidates at `rows` [E]."""
+        return jax.tree.map(lambda leaf: leaf[rows], self)

@@ -1,12 +1,11 @@
-"""A whole run with a fake evaluation, for tests that kill it: `python -m tests.search_driver FOLDER MODE SECONDS`.
+"""A whole run with a fake evaluation, for tests that kill it; see killable.py.
 
-SECONDS is the least time of a generation. Prints a line before it opens the folder, one when it begins
-to search, one a generation, one at its end.
+Prints a line before it opens the folder, one when it begins to search, one a generation, one at its end or when it was
+asked to stop.
 """
 
-import sys
+import os
 import time
-from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -15,7 +14,12 @@ import yaml
 
 from rtcd_jax import config as configuration
 from rtcd_jax import search, storage
+from rtcd_jax.cli import PREEMPTED
+from rtcd_jax.cluster import Cluster, Preempted, part
+from rtcd_jax.spread import spread
 from tests.fake_evaluation import bowl
+
+CHUNK = 4
 
 
 def experiment(mode="joint", **search_changes):
@@ -42,22 +46,26 @@ def results(found):
         yield arrays, {"volume": evaluation.volumes.total, "generation": found.generations[k]}
 
 
-def drive(path, config, seconds=0.0):
+def drive(path, config, seconds=0.0, cluster=None):
     plan = plan_of(config)
     print("opening", flush=True)
-    with storage.RunFolder.open(path, config) as folder:
+    cluster = cluster or Cluster.of()
+    evaluate = spread(bowl, cluster, CHUNK)
+    with storage.RunFolder.open(path, config, cluster) as folder:
         begun = state = folder.restore(begin(plan))
         print("from", int(begun.generation), flush=True)
-        for state, record in search.run(plan, bowl, begun):
-            time.sleep(seconds)
-            folder.append(vars(record))
-            print("generation", record.index, flush=True)
-            folder.save_if_due(state, int(state.generation))
+        try:
+            for state, record in search.run(plan, evaluate, begun):
+                time.sleep(seconds)
+                folder.append(vars(record))
+                print("generation", record.index, flush=True)
+                folder.save_if_due(state, int(state.generation))
+        except Preempted:
+            folder.save(state, int(state.generation))
+            print("preempted", int(state.generation), flush=True)
+            part()
+            os._exit(PREEMPTED)
         folder.save(state, int(state.generation))
-        folder.write_elites(results(search.finish(plan, bowl, state)))
+        again = jax.device_get(bowl(state.elites.evaluation.genome, search.last_key(plan)))
+        cluster.on_first(lambda: folder.write_elites(results(search.finish(plan, state, again))))
     print("done", flush=True)
-
-
-if __name__ == "__main__":
-    jax.config.update("jax_enable_x64", True)
-    drive(Path(sys.argv[1]), experiment(sys.argv[2]), float(sys.argv[3]))

@@ -115,6 +115,13 @@ WRONG = {
     "negative elite": (["export", "configs", "--to", "x", "--elite", "-1"], "--elite = -1: must be >= 0, or initial"),
     "no such elite's name": (["export", "configs", "--to", "x", "--elite", "best"], "--elite"),
     "nowhere to export to": (["export", "configs"], "--to"),
+    "no run to report": (["report"], "which run? rtcd report RUN [RUN …] [--to FILE]"),
+    "no such run to report": (["report", "configs", "no/such/run"], "no/such/run: no such run folder"),
+    "no such run to animate": (["animate", "no/such/run"], "no/such/run: no such run folder"),
+    "negative seed to animate": (["animate", "configs", "--seed", "-1"], "--seed = -1: must be >= 0"),
+    "no such run to replay": (["replay", "no/such/run", "x.csv"], "no/such/run: no such run folder"),
+    "nothing to replay": (["replay", "configs"], "FILE"),
+    "negative elite to replay": (["replay", "configs", "x.csv", "--elite", "-1"], "--elite = -1: must be >= 0"),
     "misspelt verify option": (["verify", "configs", "--sed", "1"], "--seed"),
 }
 
@@ -153,9 +160,10 @@ def run_module(monkeypatch):
     """Stands in for the run: records what the command line hands over."""
     calls = []
     module = types.ModuleType("rtcd_jax.run")
-    module.optimize = lambda config, folder, console: calls.append((config, folder))
+    module.optimize = lambda config, folder, console, cluster: calls.append((config, folder))
     monkeypatch.setitem(sys.modules, "rtcd_jax.run", module)
-    monkeypatch.setattr(cli, "_prepare_jax", lambda: None)
+    monkeypatch.setattr(cli, "_prepare_jax", lambda *_: None)
+    monkeypatch.setattr("rtcd_jax.cluster.Cluster.heed", lambda cluster: None)  # signals stay pytest's
     module.calls = calls
     return module
 
@@ -217,9 +225,36 @@ def test_verify_exits_by_the_promise(monkeypatch, tmp_path, held, code):
     module = types.ModuleType("rtcd_jax.verify")
     module.verify_run = lambda folder, states, seed, console: calls.append((folder, states, seed)) or held
     monkeypatch.setitem(sys.modules, "rtcd_jax.verify", module)
-    monkeypatch.setattr(cli, "_prepare_jax", lambda: None)
+    monkeypatch.setattr(cli, "_prepare_jax", lambda *_: None)
     assert cli.main(["verify", str(tmp_path), "--states", "10", "--seed", "3"]) == code
     assert calls == [(tmp_path, 10, 3)]
+
+
+@pytest.mark.parametrize(("kept", "code"), [(True, 0), (False, 1)])
+def test_replay_exits_by_the_funnel(monkeypatch, tmp_path, kept, code):
+    calls = []
+    module = types.ModuleType("rtcd_jax.report.replay")
+    module.replay_run = lambda folder, file, elite, console: calls.append((folder, file, elite)) or kept
+    monkeypatch.setitem(sys.modules, "rtcd_jax.report.replay", module)
+    assert cli.main(["replay", str(tmp_path), "lab.csv", "--elite", "2"]) == code
+    assert calls == [(tmp_path, Path("lab.csv"), 2)]
+
+
+@pytest.mark.parametrize(
+    ("verb", "arguments"), [("report", ["."]), ("animate", ["."]), ("replay", [".", "measured.csv"])]
+)
+def test_what_is_no_run_folder_is_told_in_one_line(verb, arguments, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(cli, "_prepare_jax", lambda: None)
+    monkeypatch.chdir(tmp_path)
+    assert cli.main([verb, *arguments]) == 2
+    assert capsys.readouterr().err == "rtcd: . is no run folder: it has no format.json\n"
+
+
+@pytest.mark.parametrize("verb", ["report", "animate", "replay"])
+def test_help_has_an_example(verb):
+    code, output, _ = rtcd(verb, "--help")
+    assert code == 0
+    assert f"Example: rtcd {verb} checkpoints/" in flat(output)
 
 
 PREPARED = """
@@ -254,3 +289,35 @@ def test_help_imports_nothing_but_the_standard_library():
     )
     process = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=ROOT)
     assert process.stdout.splitlines()[-1] == "set()"
+
+
+def test_asked_to_stop_a_run_leaves_with_the_exit_code_for_that(run_module, capsys, monkeypatch):
+    from rtcd_jax.cluster import Preempted
+
+    def asked(*arguments):
+        raise Preempted
+
+    class Left(BaseException):
+        pass
+
+    def leave(code):
+        raise Left(code)
+
+    run_module.optimize = asked
+    monkeypatch.setattr(cli.os, "_exit", leave)
+    with pytest.raises(Left, match=r"^85$"):
+        cli.main(["optimize", RTCD])
+    assert "saved in checkpoints/pendulum_rtcd; the same command goes on" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--devices", "0"], r"--devices = 0: must be >= 1"),
+        (["--coordinator", "a:1"], r"--num_processes, --process_id: must be given too"),
+        (["--coordinator", "a:1", "--num_processes", "2", "--process_id", "2"], r"must be < --num_processes = 2"),
+    ],
+)
+def test_devices_and_processes_are_checked_before_anything_starts(options, message, capsys):
+    assert cli.main(["optimize", RTCD, *options]) == 2
+    assert re.search(message, capsys.readouterr().err)

@@ -20,6 +20,7 @@ from rtcd_jax.config import (
     load,
     parse,
     parse_yaml,
+    resolved,
 )
 from rtcd_jax.errors import ConfigError
 
@@ -103,6 +104,16 @@ REFUSED = {
         "design.lenght: unknown design field of pendulum; did you mean 'length'? Valid: mass, length",
     ),
     "zero design": ({"design.mass.min": 0}, "design.mass.min = 0.0: must be > 0: masses and lengths are positive"),
+    "text for an option": (
+        {"policy.authority": "x"},
+        "policy.authority = 'x': must be a number, or a mapping with the",
+    ),
+    "boolean for an option": ({"policy.discount": True}, "policy.discount = True: must be a number, or a mapping with"),
+    "half a searched option": ({"policy.discount": {"min": 0, "max": 1}}, "policy.discount.initial: is missing; value"),
+    "crossed option": (
+        {"policy.authority": {"initial": 0.5, "min": 0.5, "max": 0.1}},
+        "policy.authority.min = 0.5: must be <= max = 0.1",
+    ),
     "zero weight": ({"weights.q.0.min": 0}, "weights.q.0.min = 0.0: must be > 0: weights have a log scale"),
     "mixed without a share": (
         {"funnel.mjx_share": 0},
@@ -177,6 +188,14 @@ ENDS = [
     ("elites.trials", 1, 0),
     ("elites.directions", 1, 0),
     ("checkpoint.seconds", 0, -1e-9),
+    ("policy.input_weight", 1e-9, 0),
+    ("policy.authority", 1, 1.001),
+    ("policy.authority", 1e-9, 0),
+    ("policy.authority", {"initial": 1, "min": 1e-9, "max": 1}, {"initial": 1, "min": 0, "max": 1}),
+    ("policy.authority", {"initial": 1, "min": 0.1, "max": 1}, {"initial": 1, "min": 0.1, "max": 1.001}),
+    ("policy.discount", 0, -1e-9),
+    ("policy.discount", 9, math.inf),
+    ("policy.discount", {"initial": 0, "min": 0, "max": 1}, {"initial": 0, "min": -1, "max": 1}),
 ]
 
 
@@ -321,6 +340,24 @@ def test_variables_come_in_the_plants_order_whatever_the_files():
     data["design"] = dict(reversed(data["design"].items()))
     assert list(parse(data).variables()) == [*DESIGN, *WEIGHTS]
     assert list(parse(data).design) == ["mass", "length"]
+
+
+SEARCHED = {"initial": 0.3, "min": 0.05, "max": 1}
+
+
+def test_a_policy_s_option_is_a_number_or_a_variable():
+    fixed, searched = parse(changed({"policy.authority": 0.3})), parse(changed({"policy.authority": SEARCHED}))
+    assert fixed.policy.variables() == {}
+    assert fixed.policy.initial() == searched.policy.initial() == parse(resolved(searched)).policy.initial()
+    assert searched.policy.initial() == {"input_weight": 1.0, "authority": 0.3, "discount": 0.0}
+    assert list(searched.variables()) == [*DESIGN, *WEIGHTS, "policy.authority"]
+    assert parse_yaml(dump(searched)) == searched
+
+
+def test_a_searched_option_is_enough_to_search():
+    pinned = {f"{key}.pinned": True for key in (*DESIGN, *WEIGHTS)}
+    assert errors(pinned) == ["the configuration: nothing to search: every variable is pinned or has min = max"]
+    assert errors({**pinned, "policy.discount": {"initial": 0, "min": 0, "max": 1}}) == []
 
 
 def test_free_means_movable():

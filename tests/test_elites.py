@@ -145,13 +145,25 @@ def test_the_objective_decides_the_order():
     assert (by_sum[0], by_inlet[0]) == (2.0, 1.0)
 
 
-def test_jitted_equals_plain_and_the_shapes_stay():
-    evaluation = random_population(2)
-    plain = merged([evaluation])
-    jitted = jax.jit(elites.merge, static_argnums=(2,))(nothing(), evaluation, "sum", 0, DISTANCE)
-    assert same(plain, jitted)
-    shapes = [jax.tree.map(lambda leaf: (leaf.shape, leaf.dtype), archive) for archive in (plain, nothing())]
+def test_shapes_and_dtypes_stay():
+    archives = merged([random_population(2)]), nothing()
+    shapes = [jax.tree.map(lambda leaf: (leaf.shape, leaf.dtype), archive) for archive in archives]
     assert shapes[0] == shapes[1]
+
+
+def test_records_are_asked_for_only_where_one_enters():
+    class Asked:
+        def __init__(self, evaluation):
+            self.genome, self.volumes, self.status = evaluation.genome, evaluation.volumes, evaluation.status
+
+        def take(self, rows):
+            raise LookupError(rows)
+
+    better, worse = population([[0.5, 0.5]], [2.0]), population([[0.5, 0.51]], [1.0])
+    archive = merged([better])
+    assert same(elites.merge(archive, Asked(worse), "sum", 1, DISTANCE), archive)
+    with pytest.raises(LookupError):
+        elites.merge(merged([worse]), Asked(better), "sum", 1, DISTANCE)
 
 
 def test_single_precision_evaluations_are_kept_as_they_are():

@@ -1,9 +1,6 @@
 """A population's evaluation is that of its candidates, however they are chunked and spread."""
 
 import dataclasses
-import os
-import subprocess
-import sys
 from functools import partial
 from pathlib import Path
 
@@ -104,61 +101,3 @@ def test_a_resampled_funnel_is_about_the_same_policy():
 def test_the_chunk_does_not_matter(chunk):
     """It bounds the memory: also one that does not divide the population."""
     _assert_close(_rechunked(chunk)(pipeline.genomes(), pipeline.GENERATION), pipeline.evaluated())
-
-
-SHARED_OUT = """
-import jax
-jax.config.update("jax_enable_x64", True)
-import jax.numpy as jnp
-import numpy as np
-from rtcd_jax.evaluation import spread
-from tests.fake_evaluation import bowl
-from tests.pipeline import same
-key, devices = jax.random.key(0), jax.devices()
-assert len(devices) == 4
-for count in (1, 3, 4, 5, 8):
-    genomes = jnp.asarray(np.random.default_rng(count).uniform(size=(count, 3)))
-    alone = jax.jit(bowl)(genomes, key)
-    for n in (1, 2, 4):
-        many = spread(bowl, devices[:n])(genomes, key)
-        assert many.genome.shape == genomes.shape, many.genome.shape
-        assert same(jax.device_get(many), jax.device_get(alone)), (count, n)
-print("equal")
-"""
-
-WHOLE = """
-import jax
-jax.config.update("jax_enable_x64", True)
-from rtcd_jax.evaluation import make_evaluate, spread
-from tests import pipeline
-from tests.test_evaluation import _assert_close
-evaluate, devices = make_evaluate(pipeline.problem()), jax.devices()
-
-def on(n):
-    return jax.device_get(spread(evaluate, devices[:n])(pipeline.genomes(), pipeline.GENERATION))
-
-one, two, four = map(on, (1, 2, 4))
-_assert_close(two, one)
-_assert_close(four, one)
-assert pipeline.same(on(4), four)
-print("equal")
-"""
-
-
-def _on_four_devices(code: str) -> str:
-    environment = os.environ | {"JAX_NUM_CPU_DEVICES": "4", "JAX_PLATFORMS": "cpu", "PYTHONPATH": str(ROOT)}
-    process = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT, env=environment)
-    assert process.returncode == 0, process.stderr
-    return process.stdout
-
-
-def test_candidates_are_shared_out_over_devices_and_come_back_in_order():
-    """Bit by bit, also where the devices do not divide the population or are more than it."""
-    assert _on_four_devices(SHARED_OUT) == "equal\n"
-
-
-@pytest.mark.slow
-def test_a_population_spread_over_devices_is_that_of_one_device():
-    """Five candidates on 1, 2 and 4 devices: equal but for the rounding of programs of other sizes, the same devices
-    give the same bits."""
-    assert _on_four_devices(WHOLE) == "equal\n"

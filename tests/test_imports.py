@@ -19,7 +19,8 @@ LAYERS = (
     {"population", "trajectory", "policy", "rollout"},
     {"confirmation"},
     {"funnel", "volume"},
-    {"evaluation", "results"},
+    {"evaluation", "results", "cluster"},
+    {"spread"},
     {"cmaes", "elites", "loops"},
     {"search"},
     {"storage"},
@@ -41,6 +42,8 @@ OWNERS = {
     "tyro": {"options"},
     "yaml": {"config", "export"},
     "matplotlib": {"report"},
+    "PIL": {"report"},
+    "imageio_ffmpeg": {"report"},
     "pydantic": {"settings", "config", "options"},
     "pydantic_core": {"settings"},
 }
@@ -52,7 +55,7 @@ ALONE = {
     "console": set(),
     "files": {"errors"},
     "cmaes": {"cmaes", "numerics", "errors"},
-    "certificate.check": set(),
+    "certificate.check": {"certificate.check"},
 }
 
 # Modules that must start fast, so that wrong input is refused at once.

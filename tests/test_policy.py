@@ -14,7 +14,7 @@ from scipy.interpolate import CubicHermiteSpline
 
 from rtcd_jax.config import load
 from rtcd_jax.plants.pendulum import PendulumDesign
-from rtcd_jax.policy import goal_value, linearize, nominal, stabilize
+from rtcd_jax.policy import goal_value, linearize, nominal, options, stabilize
 from rtcd_jax.problem import make_problem
 from rtcd_jax.trajectory import plan
 from rtcd_jax.types import Candidate, Status
@@ -254,6 +254,21 @@ def test_options_solve_their_own_riccati_equation(problem, cautious, candidates,
         np.testing.assert_allclose(found.reshape(2, 2), s[k], rtol=3e-3)  # five substeps an interval
         _, b = linearize(problem, soft, trajectory.xs[k], trajectory.us[k])
         np.testing.assert_allclose(policy.gains[k], np.asarray(b).T @ s[k] / weights[k], rtol=1e-9)
+
+
+def test_a_candidate_s_own_options_go_before_the_configuration_s(problem, cautious, candidates, planned):
+    """Searched or fixed, the same numbers are the same controller; others are another."""
+    soft, trajectory = take(candidates, SOFT), take(planned, SOFT)
+    weighed = problem.config.policy.model_copy(update={"input_weight": 0.3})
+    searched = dataclasses.replace(problem, config=problem.config.model_copy(update={"policy": weighed}))
+    chosen = dataclasses.replace(soft, authority=jnp.asarray(0.2), discount=jnp.asarray(0.7))
+    fixed = jax.jit(partial(stabilize, cautious))(soft, trajectory)
+    found = jax.jit(partial(stabilize, searched))(chosen, trajectory)
+    np.testing.assert_allclose(found.values, fixed.values, rtol=1e-12)
+    np.testing.assert_allclose(found.gains, fixed.gains, rtol=1e-12)
+    assert options(searched, chosen) == pytest.approx(OPTIONS)
+    other = dataclasses.replace(chosen, discount=jnp.asarray(0.0))
+    assert not np.allclose(jax.jit(partial(stabilize, searched))(other, trajectory).gains, fixed.gains, rtol=1e-2)
 
 
 def _riccati_rate(problem, candidate, motion, k, share, v, u, weight):

@@ -71,6 +71,34 @@ def test_pinned_variables_have_no_dimension_and_keep_their_value(pinned):
     assert initial_genome(pinned).shape == (3,)
 
 
+@pytest.fixture(scope="module")
+def optional():
+    """The policy's options searched, the rest pinned."""
+    searched = """
+policy: {authority: {initial: 0.1, min: 0.04, max: 1}, discount: {initial: 0.5, min: 0, max: 2}}
+search: {mode: nested, population: 32}
+"""
+    return make_problem(parse_yaml(EXAMPLE + searched))
+
+
+def test_options_of_the_policy_are_dimensions_behind_the_weights(optional):
+    """Authority on a log scale, the discount from zero on; both belong to the controller, not to the robot."""
+    names = [v.name for v in optional.free]
+    assert names[-2:] == ["policy.authority", "policy.discount"]
+    assert optional.design_dims == (True, True, *[False] * 5)
+    middle = decode(optional, jnp.full(7, 0.5))
+    assert float(middle.authority) == pytest.approx(0.2)
+    assert float(middle.discount) == pytest.approx(1)
+    initial = decode(optional, jnp.asarray(initial_genome(optional)))
+    assert (float(initial.authority), float(initial.discount)) == pytest.approx((0.1, 0.5))
+
+
+def test_fixed_options_are_the_configuration_s(problem):
+    candidate = decode(problem, jnp.zeros(5))
+    assert candidate.authority is None
+    assert candidate.discount is None
+
+
 def test_outside_the_unit_box_is_outside_the_box(problem):
     beyond = values(decode(problem, jnp.full(len(problem.free), 1.1)))
     assert np.all(beyond > [v.high for v in problem.variables])

@@ -1,5 +1,6 @@
 """The stable result format says what an evaluation holds, in the names and shapes that others read."""
 
+import dataclasses
 import json
 
 import jax
@@ -30,6 +31,16 @@ def arrays():
 @pytest.fixture(scope="module")
 def record():
     return record_of(pipeline.problem(), elite_effort(pipeline.problem()), _row(pipeline.RTCD))
+
+
+def test_the_policy_of_the_record_is_the_candidate_s():
+    """Where the search chose it; else the configuration's, as everywhere in this box."""
+    evaluation, fixed = _row(pipeline.RTCD), {"input_weight": 1.0, "authority": 1.0, "discount": 0.0}
+    chosen = dataclasses.replace(evaluation.candidate, authority=np.float64(0.25))
+    effort = elite_effort(pipeline.problem())
+    assert record_of(pipeline.problem(), effort, evaluation)["policy"] == fixed
+    searched = dataclasses.replace(evaluation, candidate=chosen)
+    assert plain(record_of(pipeline.problem(), effort, searched)["policy"]) == {**fixed, "authority": 0.25}
 
 
 @pytest.mark.parametrize(

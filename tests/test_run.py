@@ -19,6 +19,7 @@ import yaml
 
 from rtcd_jax import config as configuration
 from rtcd_jax import run
+from rtcd_jax.cluster import Cluster
 from rtcd_jax.console import Console
 from rtcd_jax.errors import UserError
 from rtcd_jax.run import LAST_FILE
@@ -112,6 +113,9 @@ def test_a_run_leaves_its_elites_best_first(finished):
     assert record["weights"]["q"] == pytest.approx([10, 1])
     assert record["weights"]["r"] == pytest.approx([0.1])
     assert record["config_hash"] == read_elite(finished / "elites", "000")[1]["config_hash"]
+    (start,) = json.loads((finished / "provenance.json").read_text())["starts"]
+    assert start["seconds"] > 0
+    assert "<h1>whole</h1>" in (finished / "report.html").read_text()
 
 
 def test_a_run_tells_its_generations(finished):
@@ -224,7 +228,7 @@ def _run_with(monkeypatch, evaluate, folder):
     monkeypatch.setattr(run, "resample", lambda problem, effort, row, key: eqx.tree_at(
         lambda e: e.status, row, jnp.int32(Status.FUNNEL_EMPTY)))  # fmt: skip
     with Console(io.StringIO()) as console:
-        run.optimize(configuration.parse(SMALL), folder, console)
+        run.optimize(configuration.parse(SMALL), folder, console, Cluster.of())
 
 
 def test_a_run_without_any_funnel_says_why(monkeypatch, tmp_path):
@@ -239,3 +243,18 @@ def test_elites_that_were_only_lucky_are_not_reported(monkeypatch, tmp_path):
     with pytest.raises(UserError, match="none of the 2 elites kept a funnel under more samples"):
         _run_with(monkeypatch, bowl, tmp_path / "run")
     assert not (tmp_path / "run" / "elites").exists()
+
+
+def test_a_failing_report_ends_nothing(monkeypatch, tmp_path):
+    """The run is finished; what went wrong is told, with the command that tries again."""
+
+    def broken(_):
+        raise RuntimeError("no fonts")
+
+    monkeypatch.setattr(run, "report", broken)
+    stream = io.StringIO()
+    with Console(stream) as console:
+        run._report(tmp_path, console)
+    assert stream.getvalue() == (
+        f"the run is finished, but its report failed: RuntimeError('no fonts'); `rtcd report {tmp_path}` makes it\n"
+    )

@@ -32,8 +32,8 @@ def results(path):
     return found
 
 
-def driver(path, mode, seconds=0.0):
-    command = [sys.executable, "-m", "tests.search_driver", str(path), mode, str(seconds)]
+def driver(path, mode, seconds=0.0, devices=1):
+    command = [sys.executable, "-m", "tests.killable", str(path), mode, str(seconds), str(devices)]
     return subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
 
 
@@ -252,6 +252,16 @@ def test_the_folder_tells_its_configuration_and_every_start(tmp_path):
         assert first["commit"].removesuffix("+") == head.stdout.strip()
 
 
+def test_every_start_tells_how_long_it_worked(tmp_path):
+    with RunFolder.open(tmp_path / "run", experiment()) as folder:
+        time.sleep(0.11)
+        folder.tell_time()
+    RunFolder.open(tmp_path / "run", experiment()).close()
+    first, second = json.loads((tmp_path / "run" / "provenance.json").read_text())["starts"]
+    assert 0.1 <= first["seconds"] < 60
+    assert "seconds" not in second
+
+
 def refused(path, config=None):
     with pytest.raises(UserError) as error:
         RunFolder.open(path, config or experiment())
@@ -357,7 +367,7 @@ def test_a_state_of_other_shapes_is_refused(tmp_path, like):
         folder.append({})
         folder.save({"a": jnp.zeros(2)}, 1)
         assert np.array_equal(folder.restore({"a": jnp.ones(2)})["a"], [0, 0])
-        with pytest.raises(UserError, match=r"state/1 is not a state of this search: another version or precision"):
+        with pytest.raises(UserError, match=r"state/1 is no state of this search: it is damaged, or another"):
             folder.restore(like)
 
 

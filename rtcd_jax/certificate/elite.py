@@ -32,7 +32,10 @@ class Step(NamedTuple):
 
 
 class Outcome(NamedTuple):
-    """A finished certificate beside what was sampled; volumes over the knots from `start` [s] on."""
+    """A finished certificate beside what was sampled; volumes over the knots from `start` [s] on.
+
+    `beside` is the rung of the `sampled` volumes: another one where the elite comes from outside.
+    """
 
     elite: str
     rung: str
@@ -41,6 +44,7 @@ class Outcome(NamedTuple):
     seconds: float
     sampled: dict[str, float]
     found: dict[str, float]
+    beside: str = "sampled"
 
     @property
     def whole(self) -> bool:
@@ -114,7 +118,8 @@ def certify_elite(
         "goal": goal,
         "notes": {"elite": name, "rung at writing": rung},
     }
-    return _finish(folder / f"{name}.json", sealed(content), arrays, rung, seconds, journal)
+    outcome = _finish(folder / f"{name}.json", sealed(content), arrays, rung, seconds, journal)
+    return outcome._replace(beside=record.get("rung", "sampled"))
 
 
 def _finish(

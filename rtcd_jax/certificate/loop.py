@@ -68,6 +68,15 @@ def rate(plant: check.Plant, parameters: Mapping[str, float], x: np.ndarray, u: 
     return np.stack([(a + b * u) / determinant for a, b in zip(drift, push, strict=True)])
 
 
+def linear(
+    plant: check.Plant, parameters: Mapping[str, float], x: np.ndarray, u: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """A [n n] and B [n] at x [n], by complex steps."""
+    step = 1e-30
+    a = np.imag(rate(plant, parameters, x[:, None] + 1j * step * np.eye(len(x)), u)) / step
+    return a, np.imag(rate(plant, parameters, x.astype(complex), u + 1j * step)) / step
+
+
 @final
 class Loop:
     """The claimed loop in float64, and the value function that shapes its funnel.
@@ -94,29 +103,28 @@ class Loop:
         self._slopes = np.zeros((len(self.u), 2, self.n, self.n))
         for k, u in enumerate(self.u):
             for end in (0, 1):
-                a, b = self._linear(self.x[k + end], u)
-                self._slopes[k, end] = _riccati(self.values[k + end], a + shift, b, q, left[k] ** 2 / r)
+                a, b = linear(self.plant, self.parameters, self.x[k + end], u)
+                self._slopes[k, end] = riccati(self.values[k + end], a + shift, b, q, left[k] ** 2 / r)
 
     def rate(self, x: np.ndarray, u: Any) -> np.ndarray:
         return rate(self.plant, self.parameters, x, u)
 
-    def _linear(self, x: np.ndarray, u: float) -> tuple[np.ndarray, np.ndarray]:
-        """A and B, by complex steps."""
-        step = 1e-30
-        a = np.imag(self.rate(x[:, None] + 1j * step * np.eye(self.n), u)) / step
-        return a, np.imag(self.rate(x.astype(complex), u + 1j * step)) / step
-
     def nominal(self, k: int, share: float) -> tuple[np.ndarray, np.ndarray]:
         """x* and x*' at a share of the interval k."""
-        return _hermite(share, self.dt, self.x[k], self.rates[k, 0], self.x[k + 1], self.rates[k, 1])
+        return hermite(share, self.dt, self.x[k], self.rates[k, 0], self.x[k + 1], self.rates[k, 1])
 
     def value(self, k: int, share: float) -> tuple[np.ndarray, np.ndarray]:
         """S and S'."""
-        return _hermite(share, self.dt, self.values[k], self._slopes[k, 0], self.values[k + 1], self._slopes[k, 1])
+        return hermite(share, self.dt, self.values[k], self._slopes[k, 0], self.values[k + 1], self._slopes[k, 1])
 
     def axes(self, k: int, share: float, rho: float, growth: float) -> tuple[np.ndarray, np.ndarray]:
-        """L with L L' = rho S^-1 and its rate, where rho' = growth rho; the angle's row has its first entry alone."""
+        """L with L L' = rho S^-1 and its rate, where rho' = growth rho; the angle's row has its first entry alone.
+
+        Raises:
+            Refused: between knots, S is not positive definite.
+        """
         s, slope = self.value(k, share)
+        check.insist(float(np.linalg.eigvalsh(s)[0]) > 0, f"interval {k}", "S is not positive definite between knots")
         p = np.linalg.inv(s) * rho
         p_rate = growth * p - p @ slope @ p / rho
         order = [self.plant.angle, *(i for i in range(self.n) if i != self.plant.angle)]
@@ -158,14 +166,13 @@ class Loop:
 
     def box_level(self, k: int, share: float) -> float:
         """The level of the ellipsoid that touches a limit on the states."""
-        center, _ = self.nominal(k, share)
-        return self._box_level(center, self.value(k, share)[0])
+        return _touching(self.rooms(k, share), self.value(k, share)[0])
 
     def goal_box_level(self) -> float:
-        return self._box_level(self.goal, self.values[-1])
-
-    def _box_level(self, center: np.ndarray, s: np.ndarray) -> float:
-        return float(np.min((self.bounds - np.abs(center)) ** 2 / np.diag(np.linalg.inv(s))))
+        """As `box_level`; half a turn away is another equilibrium, which no goal region has in it."""
+        rooms = self.bounds - np.abs(self.goal)
+        rooms[self.plant.angle] = min(rooms[self.plant.angle], np.pi)
+        return _touching(rooms, self.values[-1])
 
     def goal_growth(self, rho: float, directions: np.ndarray) -> float:
         """As `growth`, about the goal."""
@@ -178,6 +185,11 @@ class Loop:
             return 2 * np.sum((s @ error) * self.rate(self.goal[:, None] + error, u), axis=0) / rho
 
         return _highest(rises, directions)
+
+
+def _touching(rooms: np.ndarray, s: np.ndarray) -> float:
+    """The level of V = x'S x whose ellipsoid is as wide as the first of the rooms that it fills."""
+    return float(np.min(rooms**2 / np.diag(np.linalg.inv(s))))
 
 
 def _highest(f: Callable[[np.ndarray], np.ndarray], directions: np.ndarray) -> float:
@@ -199,7 +211,7 @@ def _floats(values: Any) -> Any:
     return [_floats(v) for v in values] if isinstance(values, list | tuple) else float(values)
 
 
-def _hermite(share: float, dt: float, a: Any, a_rate: Any, b: Any, b_rate: Any) -> tuple[Any, Any]:
+def hermite(share: float, dt: float, a: Any, a_rate: Any, b: Any, b_rate: Any) -> tuple[Any, Any]:
     """Value and rate of the cubic with these values and rates at the ends of an interval of `dt`."""
     t, rest = share, 1 - share
     value = rest * rest * ((1 + 2 * t) * a + t * dt * a_rate) + t * t * ((3 - 2 * t) * b - rest * dt * b_rate)
@@ -207,6 +219,6 @@ def _hermite(share: float, dt: float, a: Any, a_rate: Any, b: Any, b_rate: Any) 
     return value, slope
 
 
-def _riccati(s: np.ndarray, a: np.ndarray, b: np.ndarray, q: np.ndarray, r_inverse: float) -> np.ndarray:
+def riccati(s: np.ndarray, a: np.ndarray, b: np.ndarray, q: np.ndarray, r_inverse: float) -> np.ndarray:
     """S' = -(A'S + S A - S B R^-1 B'S + Q)."""
     return -(a.T @ s + s @ a - r_inverse * np.outer(s @ b, s @ b) + q)

@@ -5,7 +5,7 @@ maximize t  such that, for every Bernstein index j and modulo |y|^2 = 1,
     p_j(y) - error - t = z'G_j z + sum_i (sigma_i g_i)_j(y),    G_j >= 0,
     sigma_i = sum_a B_a(s) z'S_ia z,    S_ia >= 0
 
-(check.py has the theorem). The time s stays outside the Gram matrices, and the sphere makes them small: with monomials
+(check has the theorem). The time s stays outside the Gram matrices, and the sphere makes them small: with monomials
 up to degree 3, 7 rows for two states and 30 for four. `solve` hands the program to Clarabel; `CvxpyProgram` is the
 same program as cvxpy states it, built once and solved for many data.
 """

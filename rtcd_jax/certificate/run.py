@@ -10,7 +10,7 @@ from collections.abc import Iterator, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol, final
+from typing import Any, final
 
 from rich.box import SIMPLE
 from rich.console import Console as Terminal
@@ -18,6 +18,7 @@ from rich.table import Table
 from scipy.stats import spearmanr
 
 from rtcd_jax.certificate.elite import Outcome, Step, certify_elite
+from rtcd_jax.console import Console
 from rtcd_jax.errors import UserError
 from rtcd_jax.files import replace_json, writing
 from rtcd_jax.storage import elite_names
@@ -28,23 +29,18 @@ RANKED = 3
 """Elites from which on a rank correlation says something."""
 
 
-class Console(Protocol):
-    def message(self, text: str, /) -> None: ...
-    def progress(self, now: Any, /) -> None: ...
-
-
 @final
 @dataclass(frozen=True)
 class Progress:
-    """All elites' certificates together; `generation` of `generations` thousandths are done."""
+    """All elites' certificates together, `done` of `total` thousandths of them."""
 
-    generation: int
-    generations: int
+    done: int
+    total: int
     step: Step
     elapsed: float
 
     def __str__(self) -> str:
-        step, share = self.step, self.generation / self.generations
+        step, share = self.step, self.done / self.total
         left = self.elapsed * (1 - share) / share if share else float("nan")
         return (
             f"elite {step.elite}  interval {step.knot + 1}/{step.knots}  back to t = {step.time:.3f} s"
@@ -79,7 +75,8 @@ def certify_run(
             outcomes[event[0]] = event[1]
     replace_json(target / "summary.json", {name: _summary(outcomes[name]) for name in names})
     finished = [outcome for name in names if (outcome := outcomes[name]) is not None]
-    console.message(_table(finished, rung))
+    beside = "/".join(dict.fromkeys(outcome.beside for outcome in finished)) or "sampled"
+    console.message(_table(finished, f"volumes: {beside} / {rung}"))
     if len(finished) >= RANKED:
         correlation = rank_correlation(finished)
         console.message(f"rank correlation of sampled and {rung} sums over {len(finished)} elites: {correlation:.3f}")
@@ -134,8 +131,8 @@ def _summary(outcome: Outcome | None) -> dict[str, Any] | None:
     return None if outcome is None else outcome._asdict()
 
 
-def _table(outcomes: Sequence[Outcome], rung: str) -> str:
-    table = Table(box=SIMPLE, title=f"volumes: sampled / {rung}")
+def _table(outcomes: Sequence[Outcome], title: str) -> str:
+    table = Table(box=SIMPLE, title=title)
     table.add_column("elite")
     for heading in ("from, s", "intervals", "took, s", "inlet", "sum", "ratio of sums", "integral", "goal"):
         table.add_column(heading, justify="right")

@@ -144,7 +144,8 @@ def _template(robot: type[Plant], dtype: np.dtype) -> tuple[mjx.Model, mjx.Data]
     # L'DL written out elementwise: a batched dense Cholesky calls LAPACK once a lane on the CPU.
     model.opt.jacobian = mujoco.mjtJacobian.mjJAC_SPARSE
     with jax.ensure_compile_time_eval(), _promotion():
-        pair = mjx.put_model(model, impl="jax"), mjx.make_data(model, impl="jax")
+        here = jax.local_devices()[0]  # by default MJX takes the first one of all processes
+        pair = mjx.put_model(model, here, impl="jax"), mjx.make_data(model, here, impl="jax")
         return jax.tree.map(lambda leaf: _as_float(np.asarray(leaf), dtype), pair)
 
 

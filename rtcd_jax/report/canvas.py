@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 from rtcd_jax.files import replace, writing
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 WIDTH = 7.2
@@ -29,6 +30,16 @@ _STYLE = {
     "pdf.fonttype": 42,  # text that can be searched and edited
 }
 _DPI = 200
+
+
+def logarithmic(axes: "Axes") -> None:
+    """A logarithmic y axis whose few labels are plain numbers, for small panels."""
+    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+
+    axes.set_yscale("log")
+    axes.yaxis.set_major_locator(LogLocator(subs=(1, 3), numticks=5))
+    axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    axes.yaxis.set_minor_formatter(NullFormatter())
 
 
 @contextlib.contextmanager

@@ -44,7 +44,7 @@ def draw_levels(run: Run) -> list[Path]:
         volumes.set(xlabel="time [s]", ylabel=f"volume [{volume_unit(run.config)}]")
         for axes in (levels, volumes):
             axes.grid(axis="y", lw=0.4, color=LIGHT)
-        levels.legend(title=rung(run.best.record))
+        figure.legend(handles=levels.lines, title=rung(run.best.record), ncols=2, loc="outside upper center")
         return written(figure, run.path / "figures", "levels")
 
 
@@ -59,7 +59,7 @@ def draw_over(runs: Sequence[Run], folder: Path, name: str) -> list[Path]:
         for axes, plane in zip(panels, pairs, strict=True):
             draw_shadows(axes, funnels, plane)
             frame(axes, config, plane, window(funnels, plane))
-        figure.legend(**_told_once(panels), loc="outside upper center")
+        figure.legend(**told_once(panels), loc="outside upper center")
         for funnel in funnels:
             volumes.semilogy(funnel.time, funnel.per_knot, color=funnel.color, label=_told(config, funnel))
         volumes.set(xlabel="time [s]", ylabel=f"volume of a knot's\nellipsoid [{volume_unit(config)}]")
@@ -72,10 +72,16 @@ def draw_shadows(axes: "Axes", funnels: Sequence[Shown], plane: tuple[int, int])
     """Funnels in their own colors over one another, the one that reaches farthest lowest."""
     from matplotlib.collections import PolyCollection
     from matplotlib.colors import to_rgba
+    from matplotlib.patches import PathPatch
+    from matplotlib.path import Path as Curve
 
     for funnel in sorted(funnels, key=lambda funnel: -float(funnel.per_knot.max())):
-        face, edge = to_rgba(funnel.color, 0.06), to_rgba(funnel.color, 0.5)
-        axes.add_collection(PolyCollection(list(shadow(funnel, plane)), facecolors=face, edgecolors=edge, lw=0.5))
+        curves = list(shadow(funnel, plane))
+        # One curve of all ellipses is filled once: their shades do not add up where they overlap.
+        whole = Curve.make_compound_path(*map(Curve, curves))
+        axes.add_patch(PathPatch(whole, facecolor=to_rgba(funnel.color, 0.15), lw=0))
+        edges = to_rgba(funnel.color, 0.45)
+        axes.add_collection(PolyCollection(curves, facecolors="none", edgecolors=edges, lw=0.5))
         axes.plot(*funnel.x[:, plane].T, color=funnel.color, label=funnel.label, zorder=3)
 
 
@@ -121,14 +127,14 @@ def _beside(figure: "Figure", run: Run) -> None:
                 axes.set_title(_title(config, funnel))
             panels.append(axes)
     figure.colorbar(colors, ax=panels, label="time [s]", pad=0.02, aspect=30 * len(pairs))
-    figure.legend(**_told_once(panels), loc="outside upper center", title=run.absence or None)
+    figure.legend(**told_once(panels), loc="outside upper center", title=run.absence or None)
     volumes = figure.add_subplot(grid[-1, :])
     _draw_volumes(volumes, config, funnels)
     # The figure's legend, not the panel's: its width must not squeeze the panels.
     figure.legend(handles=volumes.lines, loc="outside lower center")
 
 
-def _told_once(panels: Sequence["Axes"]) -> dict[str, Any]:
+def told_once(panels: Sequence["Axes"]) -> dict[str, Any]:
     """The entries of a legend, in one row, for all that the panels have in common."""
     found = [zip(*axes.get_legend_handles_labels(), strict=True) for axes in panels]
     handles = {label: handle for pairs in found for handle, label in pairs}

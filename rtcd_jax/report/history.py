@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from rtcd_jax.config import Config, Variable
+from rtcd_jax.report.words import letter, words
 
 Generations = Sequence[Mapping[str, Any]]
 QUANTILES = (10, 90)
@@ -39,13 +40,16 @@ def failures(generations: Generations) -> dict[str, Float[np.ndarray, " generati
 
 
 def searched(config: Config) -> dict[str, tuple[Variable, str]]:
-    """The free variables by their dotted names, in the order of the genome, with units."""
+    """The free variables by their dotted names, in the order of the genome, with what they are called and units."""
     plant = config.plant
-    rates = [f"1/(s ({unit})²)" for unit in (*plant.states.values(), *plant.inputs.values())]
-    units = [*plant.design.values(), *rates]
+    titles = [f"{words(name)} [{unit}]" for name, unit in plant.design.items()]
+    for sign, named in (("q", plant.states), ("r", plant.inputs)):
+        titles += [
+            f"{sign}{i} of {letter(name)} [1/(s {_squared(unit)})]" for i, (name, unit) in enumerate(named.items(), 1)
+        ]
     return {
-        name: (variable, unit)
-        for (name, variable), unit in zip(config.variables().items(), units, strict=True)
+        name: (variable, title)
+        for (name, variable), title in zip(config.variables().items(), titles, strict=True)
         if variable.free
     }
 
@@ -63,7 +67,7 @@ class Course:
     """One variable through the search, in its own unit: each generation's best and its population's quantiles."""
 
     name: str
-    unit: str
+    title: str
     variable: Variable
     best: Float[np.ndarray, " generations"]
     low: Float[np.ndarray, " generations"]
@@ -91,6 +95,10 @@ def courses(config: Config, generations: Generations) -> list[Course]:
             best[index] = genomes[index, volumes.argmax()]
     quantiles = np.percentile(genomes, (QUANTILES[0], 50, QUANTILES[1]), axis=1)
     return [
-        Course(name, unit, variable, *(physical(name, variable, share[:, i]) for share in (best, *quantiles)))
-        for i, (name, (variable, unit)) in enumerate(searched(config).items())
+        Course(name, title, variable, *(physical(name, variable, share[:, i]) for share in (best, *quantiles)))
+        for i, (name, (variable, title)) in enumerate(searched(config).items())
     ]
+
+
+def _squared(unit: str) -> str:
+    return f"({unit})²" if "/" in unit or " " in unit else f"{unit}²"

@@ -4,13 +4,14 @@ const touch = matchMedia("(pointer: coarse)").matches;
 const narrow = matchMedia("(max-width: 600px)").matches;
 const font = { family: "system-ui, -apple-system, 'Segoe UI', Roboto, 'DejaVu Sans', sans-serif", size: 12, color: "#1c2733" };
 const axis = { gridcolor: "#e9edf1", zeroline: false, linecolor: "#c6ced6", showline: true, ticks: "outside", automargin: true };
-const config = { responsive: true, displaylogo: false, displayModeBar: touch ? false : "hover" };
+const buttons = [["toImage", "zoom2d", "pan2d", "resetScale2d"]];
+const config = { responsive: true, displaylogo: false, displayModeBar: !touch, modeBarButtons: buttons };
 
 function layoutOf(name, own) {
   const layout = {
     font, margin: { l: 56, r: 12, t: own.title ? 34 : 12, b: 46 }, paper_bgcolor: "#fff", plot_bgcolor: "#fff",
     hovermode: name.startsWith("plane") ? "closest" : "x unified",
-    legend: { orientation: "h", x: 0, y: 1, yanchor: "bottom", xanchor: "left" },
+    legend: { orientation: "h", x: 0, y: 1, yanchor: "bottom", xanchor: "left", traceorder: "normal" },
     dragmode: touch ? false : "zoom",  // a finger scrolls the page
     ...own,
   };
@@ -59,7 +60,7 @@ show(0);
 function keyOf(row, column) {
   const cell = row.cells[column];
   if (cell.dataset.value !== undefined) return Number(cell.dataset.value);
-  return cell.classList.contains("number") ? null : cell.textContent;
+  return cell.dataset.none === undefined ? cell.textContent : null;
 }
 
 function compare(a, b) {

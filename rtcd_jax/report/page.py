@@ -25,6 +25,10 @@ from rtcd_jax.report.words import NONE, duration, listed, ratio, rung, words
 POLICY = "default-src 'none'; script-src 'unsafe-inline'; style-src 'unsafe-inline'; img-src data: blob:"
 """What the browser may do: run and show what is in the page."""
 
+LONGEST = 40
+"""Characters of a cell that is not wrapped."""
+_NUMBER, _LONG = ' class="number"', ' class="long"'
+
 
 def report(folders: Sequence[Path], to: Path | None = None) -> list[Path]:
     """Writes the page of a finished run, or one that compares several, and its figures; the page's path first.
@@ -194,16 +198,21 @@ def _note(text: str) -> str:
 
 
 def _table(table: Table) -> str:
-    heads = "".join(f'<th scope="col"><button type="button">{html.escape(head)}</button></th>' for head in table.heads)
-    rows = "\n".join(f"<tr>{''.join(map(_cell, row))}</tr>" for row in table.rows)
+    columns = zip(table.heads, table.numeric, strict=True)
+    heads = "".join(_head(head, numeric) for head, numeric in columns)
+    rows = "\n".join(f"<tr>{''.join(map(_cell, row, table.numeric))}</tr>" for row in table.rows)
     return f'<div class="scroll"><table>\n<thead><tr>{heads}</tr></thead>\n<tbody>\n{rows}\n</tbody></table></div>'
 
 
-def _cell(value: Cell) -> str:
+def _head(text: str, numeric: bool) -> str:
+    return f'<th scope="col"{_NUMBER * numeric}><button type="button">{html.escape(text)}</button></th>'
+
+
+def _cell(value: Cell, numeric: bool) -> str:
     if isinstance(value, str):
-        return f"<td>{html.escape(value)}</td>"
-    sorted_by = "" if value is None else f' data-value="{value!r}"'
-    return f'<td class="number"{sorted_by}>{_told(value)}</td>'
+        return f"<td{_LONG * (len(value) > LONGEST)}>{html.escape(value)}</td>"
+    sorted_by = " data-none" if value is None else f' data-value="{value!r}"'
+    return f"<td{_NUMBER * numeric}{sorted_by}>{_told(value)}</td>"
 
 
 def _told(value: float | int | None) -> str:

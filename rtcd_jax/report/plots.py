@@ -66,7 +66,7 @@ def levels_plot(config: Config, funnels: Sequence[Shown]) -> Plot:
         for funnel in funnels:
             told = {"name": funnel.label, "legendgroup": funnel.label, "showlegend": axis == "y2"}
             line = {"x": _numbers(funnel.time), "y": _numbers(values(funnel)), "yaxis": axis, "mode": "lines+markers"}
-            data.append(told | line | {"line": {"color": funnel.color}, "marker": {"size": 4}})
+            data.append(told | line | {"line": {"color": funnel.color}, "marker": {"size": 3}})
     return {
         "data": data,
         "layout": {
@@ -91,7 +91,7 @@ def convergence_plot(run: Run) -> Plot:
         color = STATUS_COLORS.get(name, GRAY)
         stacked = {"stackgroup": "status", "yaxis": "y2", "fillcolor": color}
         data.append(_line(index, share, told_status(name), color, width=0) | stacked)
-    data.append(_line(index, column(generations, "sigma"), "step size", BLACK) | {"yaxis": "y3"})
+    data.append(_line(index, column(generations, "sigma"), "σ", BLACK) | {"yaxis": "y3", "showlegend": False})
     objective = run.config.search.objective
     unit = volume_unit(run.config, objective)
     return {
@@ -100,14 +100,14 @@ def convergence_plot(run: Run) -> Plot:
             "xaxis": {"title": {"text": "generation"}, "anchor": "y3"},
             "yaxis": {"title": {"text": f"volume ({words(objective)}) [{unit}]"}, "domain": [0.5, 1]},
             "yaxis2": {"title": {"text": "candidates by status"}, "domain": [0.23, 0.45], "range": [0, 1]},
-            "yaxis3": {"title": {"text": "step size σ"}, "domain": [0, 0.18], "type": "log", "exponentformat": "power"},
+            "yaxis3": {"title": {"text": "step size σ"}, "domain": [0, 0.18], **_LOG},
         },
     }
 
 
 def progress_plot(runs: Sequence[Run]) -> Plot:
-    """The best so far of several searches over their candidates, each in the unit of its own objective."""
-    data = []
+    """The best so far of several searches over their candidates, each by its own objective."""
+    data, units = [], {volume_unit(run.config, run.config.search.objective) for run in runs}
     for run in runs:
         objective = run.config.search.objective
         evaluated = _numbers(column(run.generations, "evaluations"))
@@ -117,7 +117,7 @@ def progress_plot(runs: Sequence[Run]) -> Plot:
         "data": data,
         "layout": {
             "xaxis": {"title": {"text": "candidates"}},
-            "yaxis": {"title": {"text": f"best so far [{volume_unit(runs[0].config)}]"}},
+            "yaxis": {"title": {"text": f"best so far [{', '.join(sorted(units))}]"}},
         },
     }
 
@@ -135,7 +135,7 @@ def course_plot(course: Course, index: Sequence[float | None]) -> Plot:
             _line([index[0], index[-1]], np.array(initial), "initial", BLUE, dash="dot"),
         ],
         "layout": {
-            "title": {"text": f"{course.name} [{course.unit}]"},
+            "title": {"text": course.title},
             "xaxis": {"title": {"text": "generation"}},
             "yaxis": {"range": [low, high]} | scale,
             "showlegend": False,
@@ -143,7 +143,7 @@ def course_plot(course: Course, index: Sequence[float | None]) -> Plot:
     }
 
 
-_LOG: Mapping[str, str] = {"type": "log", "exponentformat": "power"}
+_LOG: Mapping[str, str] = {"type": "log", "exponentformat": "e"}
 
 
 def _body(funnel: Shown, plane: tuple[int, int]) -> Plot:
@@ -174,7 +174,7 @@ def _motion(config: Config, funnel: Shown, plane: tuple[int, int]) -> Plot:
         "y": y,
         "mode": "lines+markers",
         "line": {"color": funnel.color, "width": 1.5},
-        "marker": {"size": 4},
+        "marker": {"size": 4 if len(funnel.time) <= 100 else 2.5},
         "name": funnel.label,
         "legendgroup": funnel.label,
         "customdata": [_numbers(row) for row in np.stack([funnel.time, funnel.rho, funnel.per_knot], axis=1)],

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from rtcd_jax.config import Config
-from rtcd_jax.report.canvas import BLACK, GRAY, LIGHT, SMALL, WIDTH, blank, written
+from rtcd_jax.report.canvas import BLACK, GRAY, LIGHT, SMALL, WIDTH, blank, logarithmic, written
 from rtcd_jax.report.history import QUANTILES, Course, Generations, column, courses, failures, spread
 from rtcd_jax.report.reading import BLUE, VERMILION, Run
 from rtcd_jax.report.words import volume_unit, words
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 GREEN = "#009E73"
 STATUS_COLORS = {
-    "OK": "#D9EFE6",
+    "OK": "#DCE4EE",
     "TRAJECTORY_NOT_SOLVED": "#E69F00",
     "RICCATI_INDEFINITE": "#CC79A7",
     "FUNNEL_EMPTY": "#56B4E9",
@@ -79,7 +79,7 @@ def _convergence(figure: "Figure", config: Config, generations: Generations) -> 
     volumes.set_ylabel(f"volume ({words(search.objective)}) [{volume_unit(config, search.objective)}]")
     volumes.legend(title="sampled, as the search saw it", title_fontsize=SMALL)
     sigma.set(ylabel="step size\n[box widths]", xlabel="generation")
-    sigma.xaxis.get_major_locator().set_params(integer=True)
+    _whole_numbers(sigma)
 
 
 def _draw_statuses(axes: "Axes", index: np.ndarray, generations: Generations) -> None:
@@ -105,9 +105,15 @@ def _draw_course(axes: "Axes", course: Course, index: np.ndarray) -> None:
     axes.plot(index, course.best, ".", ms=4, color=VERMILION, label="best of the generation")
     axes.axhline(course.variable.initial, color=BLUE, lw=1, ls=":", label="initial")
     if course.logarithmic:
-        axes.set_yscale("log")
-    axes.set(ylim=course.window, title=f"{course.name} [{course.unit}]")
-    axes.xaxis.get_major_locator().set_params(integer=True)
+        logarithmic(axes)
+    axes.set(ylim=course.window, title=course.title)
+    _whole_numbers(axes)
+
+
+def _whole_numbers(axes: "Axes") -> None:
+    from matplotlib.ticker import MaxNLocator
+
+    axes.xaxis.set_major_locator(MaxNLocator(integer=True))
 
 
 def _wide(axes: "Axes") -> None:
@@ -115,4 +121,4 @@ def _wide(axes: "Axes") -> None:
     numbers = np.concatenate([line.get_ydata() for line in axes.lines])
     numbers = numbers[np.isfinite(numbers)]
     if numbers.size and 0 < 10 * numbers.min() < numbers.max():
-        axes.set_yscale("log")
+        logarithmic(axes)

@@ -54,9 +54,26 @@ class Camera:
     def __exit__(self, *_: object) -> None:
         self._renderer.close()
 
+    def reach(self, positions: Float[np.ndarray, "poses q"]) -> float:
+        """How far the robot gets from the origin in the picture's plane, to each side and up and down [m]."""
+        farthest = 0.0
+        for pose in positions:
+            self._pose(pose)
+            across = np.abs(self._data.geom_xpos[:, [0, 2]]).max(axis=1)
+            farthest = max(farthest, float((across + self._model.geom_rbound).max()))
+        return farthest
+
+    def frame(self, height: float) -> None:
+        """Lets the picture show `height` [m] above and below its middle."""
+        camera = self._model.camera(self._camera)
+        camera.fovy[:] = 2 * np.degrees(np.arctan(height / np.linalg.norm(camera.pos)))
+
     def picture(self, positions: Float[np.ndarray, " q"]) -> UInt8[np.ndarray, "height width 3"]:
         """The robot at these joint positions."""
-        self._data.qpos[:] = positions
-        self._mujoco.mj_forward(self._model, self._data)  # pyright: ignore[reportAttributeAccessIssue]
+        self._pose(positions)
         self._renderer.update_scene(self._data, self._camera)
         return self._renderer.render()
+
+    def _pose(self, positions: np.ndarray) -> None:
+        self._data.qpos[:] = positions
+        self._mujoco.mj_forward(self._model, self._data)  # pyright: ignore[reportAttributeAccessIssue]

@@ -2,7 +2,7 @@
 
 import csv
 import io
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol, final
@@ -14,12 +14,15 @@ from rtcd_jax.config import Config
 from rtcd_jax.errors import UserError
 from rtcd_jax.files import replace, replace_json, writing
 from rtcd_jax.report.canvas import BLACK, GRAY, LIGHT, WIDTH, blank, written
-from rtcd_jax.report.funnels import draw_shadows, frame, window
+from rtcd_jax.report.funnels import draw_shadows, frame, told_once, window
 from rtcd_jax.report.measured import Measured, jumps, read_measured
 from rtcd_jax.report.reading import BLUE, VERMILION, Shown
 from rtcd_jax.report.shapes import planes
 from rtcd_jax.report.tube import Tube
 from rtcd_jax.storage import elite_names, read_config, read_elite
+
+LEAST = 1e-4
+"""V/rho that the figure still tells from zero."""
 
 
 class Console(Protocol):
@@ -108,7 +111,7 @@ def _summary(replay: Replay) -> list[str]:
     if replay.kept:
         lines.append(f"inside the funnel all the way; smallest margin 1 - V/rho = {told['smallest_margin']:.3g}")
         return [*lines, f"closest to its boundary {_at(told['closest'])}"]
-    lines.append(f"LEFT the funnel first {_at(told['first_exit'])}")
+    lines.append(f"OUTSIDE the funnel, first {_at(told['first_exit'])}")
     return [*lines, f"farthest outside {_at(told['closest'])}; {told['share_inside']:.1%} of the samples inside"]
 
 
@@ -122,8 +125,8 @@ def _table(replay: Replay) -> str:
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow([*replay.measured.columns, "V/rho", "inside"])
-    rows: Sequence[Any] = np.column_stack([replay.measured.time, replay.measured.x, replay.fill])
-    writer.writerows([*map(repr, map(float, row)), int(row[-1] <= 1)] for row in rows)
+    rows = np.column_stack([replay.measured.time, replay.measured.x, replay.fill]).tolist()
+    writer.writerows([*map(repr, row), int(row[-1] <= 1)] for row in rows)
     return text.getvalue()
 
 
@@ -139,8 +142,8 @@ def _draw(config: Config, funnel: Shown, replay: Replay, folder: Path, name: str
             low, high = window([funnel], plane)
             view = np.stack([np.minimum(low, motion.min(0)), np.maximum(high, motion.max(0))])
             frame(axes, config, plane, view)
-        panels[0].legend()
-        fill.semilogy(replay.measured.time, np.maximum(replay.fill, 1e-6), color=BLUE)
+        figure.legend(**told_once(panels), loc="outside upper center")
+        fill.semilogy(replay.measured.time, np.maximum(replay.fill, LEAST), color=BLUE)
         fill.axhline(1, color=BLACK, lw=1, ls="--")
         fill.axvline(float(funnel.time[-1]), color=GRAY, lw=1, ls=":")
         fill.set(xlabel="time [s]", ylabel="V/ρ [-]")

@@ -19,6 +19,12 @@ class Table:
     heads: tuple[str, ...]
     rows: tuple[tuple[Cell, ...], ...]
 
+    @property
+    def numeric(self) -> list[bool]:
+        """Of every column, whether it has numbers alone."""
+        columns = [[row[i] for row in self.rows if row[i] is not None] for i in range(len(self.heads))]
+        return [bool(column) and not any(isinstance(cell, str) for cell in column) for column in columns]
+
 
 def gains(runs: Sequence[Run]) -> Table:
     """Table I of the paper, (initial, optimal, ratio, time), for all volumes and rungs."""
@@ -31,7 +37,8 @@ def comparison(runs: Sequence[Run]) -> Table:
     plant = runs[0].config.plant
     heads = (
         "run", "searched", *(f"{words(name)} [{unit}]" for name, unit in plant.design.items()),
-        *_weight_heads(runs[0]), *map(words, VOLUMES), "sum × initial", "rung", "proved sum", "kept", "time",
+        *_weight_heads(runs[0]), *map(words, VOLUMES), "sum × initial", "rung", "sum shown", "rung shown", "promise",
+        "time",
     )  # fmt: skip
     return Table(heads, tuple(_compared(run) for run in runs))
 
@@ -39,11 +46,11 @@ def comparison(runs: Sequence[Run]) -> Table:
 def elites(run: Run) -> Table:
     """The archive, best first."""
     plant = run.config.plant
-    proved = {name: found["found"]["sum"] for name, found in run.certificates.items() if found}
+    shown = {name: (found["found"]["sum"], found["rung"]) for name, found in run.certificates.items() if found}
     heads = (
         "elite", *(f"{words(name)} [{unit}]" for name, unit in plant.design.items()), *_weight_heads(run),
         *(f"{words(name)} [{volume_unit(run.config, name)}]" for name in VOLUMES), "sum × initial",
-        "largest knot [%]", "swing-up [s]", "ε", "rung", *(["sum, proved"] if proved else []),
+        "largest knot [%]", "swing-up [s]", "ε", "rung", *(["sum shown", "rung shown"] if shown else []),
     )  # fmt: skip
     before = run.initial.volumes["sum"] if run.initial else 0.0
     rows = []
@@ -55,7 +62,7 @@ def elites(run: Run) -> Table:
             ratio(volumes["sum"], before), 100 * volumes["share_of_largest_knot"], record["duration"],
             record["epsilon"], record["rung"],
         )  # fmt: skip
-        rows.append((*told, proved.get(name)) if proved else told)
+        rows.append((*told, *shown.get(name, (None, None))) if shown else told)
     return Table(heads, tuple(rows))
 
 
@@ -125,8 +132,8 @@ def _gains_of(run: Run) -> Iterator[tuple[Cell, ...]]:
         label = f"{words(name)} (searched)" if name == searched else words(name)
         times = ratio(after, before) if before is not None else None
         yield label, volume_unit(run.config, name), before, after, times, told_time(run), run.best.record["rung"]
-    found = run.certificates.get("000")
-    for name in order if found else ():
+    found = run.certificates.get("000") or {"found": {}}
+    for name in order:
         if name in found["found"]:
             unit, took = volume_unit(run.config, name), duration(found["seconds"])
             yield words(name), unit, None, found["found"][name], None, took, found["rung"]
@@ -141,7 +148,8 @@ def _compared(run: Run) -> tuple[Cell, ...]:
         run.name, f"{words(config.search.objective)}, {config.search.mode}", *record["design"].values(),
         *record["weights"]["q"], *record["weights"]["r"], *(run.best.volumes[name] for name in VOLUMES),
         ratio(run.best.volumes["sum"], before) if before is not None else None, record["rung"],
-        found["found"]["sum"] if found else None, ("yes" if all(kept) else "NO") if kept else None, told_time(run),
+        *((found["found"]["sum"], found["rung"]) if found else (None, None)),
+        ("kept" if all(kept) else "BROKEN") if kept else None, told_time(run),
     )  # fmt: skip
 
 
@@ -165,8 +173,9 @@ def _origin(run: Run) -> Iterator[tuple[Cell, ...]]:
     yield "time", told_time(run) or "not recorded"
     yield "configuration", run.provenance.get("config_hash")
     for number, start in enumerate(run.provenance.get("starts", ()), 1):
-        where = ", ".join(str(start[key]) for key in ("device", "devices", "precision", "system") if key in start)
-        yield f"start {number}", f"{start.get('time')}, commit {start.get('commit')}, {where}"
+        where = f"{start.get('devices')} × {start.get('device')}, {start.get('precision')}, {start.get('system')}"
+        spent = f", {duration(start['seconds'])}" if "seconds" in start else ""
+        yield f"start {number}", f"{start.get('time')}{spent}, commit {start.get('commit')}, {where}"
         versions = ", ".join(f"{name} {version}" for name, version in start.get("versions", {}).items())
         yield f"versions {number}", versions
 

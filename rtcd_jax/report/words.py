@@ -14,7 +14,6 @@ NONE = "–"
 """Stands where there is no number."""
 
 _GREEK = {"alpha": "α", "beta": "β", "gamma": "γ", "phi": "φ", "psi": "ψ", "theta": "θ"}
-_DOT = "\u0307"  # above the letter before it
 _POWERS = str.maketrans("0123456789", "⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 
@@ -24,11 +23,11 @@ def words(name: str) -> str:
 
 
 def letter(name: str) -> str:
-    """A state's name, Greek ones as letters, `_dot` as a dot above them."""
+    """A state's name, Greek ones as letters and their rates as derivatives: fonts set dots above letters badly."""
     base = name.removesuffix("_dot")
     if base not in _GREEK:
         return name
-    return _GREEK[base] + (_DOT if name != base else "")
+    return _GREEK[base] if name == base else f"d{_GREEK[base]}/dt"
 
 
 def quantity(name: str, unit: str) -> str:

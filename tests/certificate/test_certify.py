@@ -110,7 +110,7 @@ def test_a_run_is_certified_in_processes_of_its_own(tmp_path, rung):
     assert summary["rung"] == rung
     assert summary["found"] == report.volumes
     assert f"sampled / {rung}" in console.lines[0]
-    assert console.steps[-1].generation == console.steps[-1].generations
+    assert console.steps[-1].done == console.steps[-1].total
     assert "back to t = 0.000 s" in str(console.steps[-1])
     assert not list((run / "certificates").glob(".*"))
 

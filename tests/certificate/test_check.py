@@ -3,9 +3,12 @@
 import copy
 import json
 import math
+import os
 import random
+import shutil
 import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -245,16 +248,21 @@ def test_exit_codes(run, tmp_path, capsys):
     assert check.main(["--help"]) == 0
 
 
-def test_as_a_script_of_its_own_without_flint(run):
-    """One file, the standard library, and the same verdict: fractions in the place of flint."""
+def test_as_a_folder_of_its_own_without_flint(run, tmp_path):
+    """The folder alone, the standard library, and the same verdict: fractions in the place of flint."""
+    package = tmp_path / "rtcd_jax" / "certificate"
+    shutil.copytree(Path(check.__file__).parent, package / "check")
+    for folder in (package, package.parent):
+        (folder / "__init__.py").touch()
+    file = run / "certificates" / "000.json"
     program = (
-        "import runpy, sys; sys.modules['flint'] = None; sys.argv = sys.argv[1:]\n"
-        "runpy.run_path(sys.argv[0], run_name='__main__')"
+        "import runpy, sys; sys.modules['flint'] = None\n"
+        "runpy.run_module('rtcd_jax.certificate.check', run_name='__main__')"
     )
-    file = str(run / "certificates" / "000.json")
-    done = subprocess.run([sys.executable, "-c", program, check.__file__, file], capture_output=True, text=True)
+    command = [sys.executable, "-c", program, str(file)]
+    done = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path, env={**os.environ, "PYTHONPATH": ""})
     assert (done.returncode, done.stderr) == (0, "")
-    assert done.stdout.startswith(check.sentence("pendulum", check.check_file(run / "certificates" / "000.json")))
+    assert done.stdout.startswith(check.sentence("pendulum", check.check_file(file)))
 
 
 def leaves(node, path=()):

@@ -2,6 +2,7 @@
 
 import base64
 import contextlib
+import fcntl
 import itertools
 import json
 import os
@@ -29,12 +30,14 @@ class Browser:
     def __init__(self, profile, patience=60.0):
         requests, self._requests = os.pipe()
         self._answers, answers = os.pipe()
-        shell = f'exec "$@" 3<&{requests} 4>&{answers}'
-        command = ["sh", "-c", shell, "sh", program(), *FLAGS, f"--user-data-dir={profile}"]
+        # The browser reads at 3 and writes at 4; copies far above these do not get into each other's way.
+        ends = [fcntl.fcntl(end, fcntl.F_DUPFD, 100) for end in (requests, answers)]
+        shell = f'exec "$@" 3<&{ends[0]} 4>&{ends[1]}'
+        command = ["bash", "-c", shell, "bash", program(), *FLAGS, f"--user-data-dir={profile}"]
         quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
-        self._process = subprocess.Popen(command, pass_fds=(requests, answers), **quiet)
-        os.close(requests)
-        os.close(answers)
+        self._process = subprocess.Popen(command, pass_fds=ends, **quiet)
+        for end in (requests, answers, *ends):
+            os.close(end)
         self._count, self._patience, self._rest = itertools.count(1), patience, b""
         self.events = []
 

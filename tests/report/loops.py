@@ -2,10 +2,8 @@
 
 import numpy as np
 
-from rtcd_jax import config as configuration
-from rtcd_jax.storage import RunFolder
 from tests.certificate import balance, swing
-from tests.report.runs import experiment
+from tests.report.runs import experiment, run_folder
 
 LOOPS = {"pendulum": swing, "cartpole": balance}
 PROMISE = {
@@ -25,8 +23,5 @@ def loop_folder(path, plant, initial=None):
     """A run folder whose elite 000 is such a loop, the initial candidate too unless `initial` says otherwise."""
     arrays, record = stored(plant)
     task = {"start": arrays["x"][0].tolist(), "goal": arrays["x_goal"].tolist()}
-    config: configuration.Config = experiment(plant, task=task)
-    with RunFolder.open(path, config) as folder:
-        folder.write_elites([(arrays, record)])
-        folder.write_initial(arrays, record | (initial or {}))
-    return path
+    config = experiment(plant, task=task)
+    return run_folder(path, config, (arrays, record | (initial or {})), (arrays, record))

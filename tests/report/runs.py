@@ -6,7 +6,8 @@ import numpy as np
 import yaml
 
 from rtcd_jax import config as configuration
-from rtcd_jax.storage import RunFolder
+from rtcd_jax.files import plain, replace_json
+from rtcd_jax.storage import FORMAT, VERSION, write_elite
 
 KNOTS = 7
 CARTPOLE = """\
@@ -85,15 +86,20 @@ def generation(index, dims=5, **changes):
 
 
 def run_folder(path, config, initial=None, best=None, generations=None):
-    """A run folder; generations are three by default."""
+    """A run folder as a search leaves it; `best` are one candidate or several, generations three by default."""
     dims = sum(variable.free for variable in config.variables().values())
-    with RunFolder.open(path, config) as folder:
-        if initial:
-            folder.write_initial(*initial)
-        if best:
-            folder.write_elites([best] if isinstance(best, tuple) else best)
-        for record in [generation(k, dims) for k in range(3)] if generations is None else generations:
-            folder.append(record)
+    elites = [best] if isinstance(best, tuple) else best or []
+    (path / "elites").mkdir(parents=True)
+    replace_json(path / "format.json", {"format": FORMAT, "version": VERSION})
+    (path / "config.yaml").write_text(configuration.dump(config))
+    start = {"time": "2026-01-01T00:00:00+00:00", "commit": "c0ffee", "versions": {"numpy": np.__version__}}
+    replace_json(path / "provenance.json", {"config_hash": configuration.config_hash(config), "starts": [start]})
+    if initial:
+        write_elite(path, "initial", *initial)
+    for index, elite in enumerate(elites):
+        write_elite(path / "elites", f"{index:03d}", *elite)
+    records = [generation(k, dims) for k in range(3)] if generations is None else generations
+    (path / "generations.jsonl").write_text("".join(json.dumps(plain(record)) + "\n" for record in records))
     return path
 
 

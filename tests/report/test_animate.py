@@ -47,7 +47,8 @@ def test_the_videos_show_both_candidates_moving(tmp_path, backend, plant):
     assert done.returncode == 0, done.stdout + done.stderr
     with Image.open(tmp_path / "videos" / "swingup.gif") as gif:
         frames = [np.asarray(frame.convert("RGB"), float) for frame in ImageSequence.Iterator(gif)]
-    assert frames[0].shape == (animate.SIDE, animate.SIDE, 3)
+    side = animate.SIDE + animate.GAP // 2
+    assert frames[0].shape == (side, side, 3)
     assert len(frames) >= 15
     half = animate.SIDE // 2
     for rows in (slice(0, half), slice(half, None)):
@@ -69,7 +70,7 @@ def test_without_an_initial_funnel_the_best_is_shown_alone(tmp_path, backend):
     assert done.returncode == 0, done.stdout + done.stderr
     assert "initial: nothing to show, it has no funnel (FUNNEL_EMPTY)" in done.stdout
     with Image.open(folder / "animation" / "swingup.gif") as gif:
-        assert gif.size == (animate.SIDE // 2, animate.SIDE)
+        assert gif.size == (animate.SIDE // 2, animate.SIDE + animate.GAP // 2)
 
 
 def test_where_nothing_draws_it_is_told_in_one_line(tmp_path):
@@ -91,12 +92,15 @@ def test_a_run_without_elites_is_refused(tmp_path):
 
 
 def test_a_failing_ffmpeg_is_told_by_its_own_words(tmp_path):
-    frames = [Image.new("RGB", (8, 8))]
     program = tmp_path / "ffmpeg"
     program.write_text("#!/bin/sh\ncat >/dev/null\necho no such codec >&2\nexit 1\n")
     program.chmod(0o755)
-    with pytest.raises(UserError, match=r"ffmpeg cannot write .*x.mp4: no such codec"):
-        animate._write_mp4(frames, tmp_path / "x.mp4", str(program))
+    with (
+        pytest.raises(UserError, match=r"ffmpeg cannot write .*x.mp4: no such codec"),
+        animate.mp4(tmp_path / "x.mp4", (8, 8), str(program)) as add,
+    ):
+        add(Image.new("RGB", (8, 8)))
+    assert [path.name for path in tmp_path.iterdir()] == ["ffmpeg"]
 
 
 def test_without_any_ffmpeg_there_is_none(monkeypatch):

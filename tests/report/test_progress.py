@@ -71,8 +71,8 @@ def test_a_variable_is_drawn_in_its_own_unit_between_the_ends_of_its_box(tmp_pat
     draw_courses(run)
     told = [axes.get_title() for axes in figures[0].axes]
     assert told == [
-        "design.mass [kg]", "design.length [m]", "weights.q.0 [1/(s (rad)²)]", "weights.q.1 [1/(s (rad/s)²)]",
-        "weights.r.0 [1/(s (N m)²)]",
+        "mass [kg]", "length [m]", "q1 of θ [1/(s rad²)]", "q2 of dθ/dt [1/(s (rad/s)²)]",
+        "r1 of torque [1/(s (N m)²)]",
     ]  # fmt: skip
     mass, *_, weight = figures[0].axes
     assert (mass.get_yscale(), weight.get_yscale()) == ("linear", "log")

@@ -81,7 +81,9 @@ def test_the_first_exit_is_told_with_time_fill_and_state(tmp_path, plant, figure
     assert told["first_exit"]["V/rho"] == pytest.approx(9.0)
     assert list(told["first_exit"]["state"].values()) == pytest.approx(x[first].tolist())
     assert told["share_inside"] == pytest.approx(first / len(time))
-    assert any(line.startswith(f"LEFT the funnel first at t = {time[first]:.4g} s: V/rho = 9") for line in said.lines)
+    assert any(
+        line.startswith(f"OUTSIDE the funnel, first at t = {time[first]:.4g} s: V/rho = 9") for line in said.lines
+    )
 
 
 def test_the_figure_shows_what_was_measured_and_marks_what_was_outside(tmp_path, figures):

@@ -49,10 +49,10 @@ def test_elites_are_told_with_designs_weights_volumes_and_rung(tmp_path):
     assert (first["sum [rad²/s]"], second["sum [rad²/s]"]) == (333, 222)
     assert (first["sum × initial"], second["sum × initial"]) == (3, 2)
     assert {row["rung"] for row in (first, second)} == {"sampled"}
-    assert "sum, proved" not in first
+    assert "sum shown" not in first
     prove_and_verify(folder)
     first, second = rows(tables.elites(read_run(folder)))
-    assert (first["sum, proved"], second["sum, proved"]) == (330.0, None)
+    assert (first["sum shown"], first["rung shown"], second["sum shown"]) == (330.0, "proved", None)
 
 
 def test_certificates_stand_beside_what_was_sampled(tmp_path):
@@ -108,9 +108,9 @@ def test_an_experiment_is_told_as_it_is(summary, heads, told):
 def test_runs_are_compared_row_by_row(tmp_path):
     folders = [prove_and_verify(finished(tmp_path / "rtc", scale=2.0)), finished(tmp_path / "rtcd", scale=5.0)]
     first, second = rows(tables.comparison(compared([read_run(folder) for folder in folders])))
-    assert (first["run"], first["sum"], first["sum × initial"], first["proved sum"]) == ("rtc", 222, 2, 330)
-    assert (second["run"], second["sum"], second["sum × initial"], second["proved sum"]) == ("rtcd", 555, 5, None)
-    assert (first["kept"], second["kept"]) == ("yes", None)
+    assert (first["run"], first["sum"], first["sum × initial"], first["sum shown"]) == ("rtc", 222, 2, 330)
+    assert (second["run"], second["sum"], second["sum × initial"], second["sum shown"]) == ("rtcd", 555, 5, None)
+    assert (first["promise"], second["promise"]) == ("kept", None)
 
 
 def test_provenance_names_configuration_and_starts(tmp_path):

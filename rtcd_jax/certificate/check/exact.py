@@ -1,0 +1,60 @@
+"""Exact numbers, and how they are rounded; python-flint's where it is installed, else the standard library's."""
+
+import math
+from fractions import Fraction
+from typing import Any
+
+try:
+    import flint
+except ImportError:  # the standard library's fractions do the same
+    flint = None
+
+Q: Any = flint.fmpq if flint else Fraction
+BITS = 80
+"""Coefficients are rounded to multiples of 2^-80; every rounding is added to a remainder."""
+MAX_ORDER = 16
+"""Of polynomials: no file may ask for more."""
+PI = Q(314159265358979323846264338327950288419716939937510, 10**50)
+PI_ERROR = Q(1, 10**49)
+
+
+class Refused(Exception):
+    """What is wrong with a certificate, and where."""
+
+    def __init__(self, place: str, reason: str):
+        super().__init__(f"{place}: {reason}")
+
+
+def insist(holds: bool, place: str, reason: str) -> None:
+    if not holds:
+        raise Refused(place, reason)
+
+
+def up(q, bits: int = BITS):
+    """The least multiple of 2^-bits that is not below q."""
+    return Q(-((-int(q.numerator) << bits) // int(q.denominator)), 1 << bits)
+
+
+def near(q, bits: int = BITS):
+    """The nearest multiple of 2^-bits, and an upper bound of the error."""
+    n, d = int(q.numerator), int(q.denominator)
+    if d <= 1 << bits and not d & (d - 1):
+        return q, Q(0)
+    return Q(((n << (bits + 1)) + d) // (2 * d), 1 << bits), Q(1, 1 << (bits + 1))
+
+
+def root_up(q):
+    """A rational not below the square root of q >= 0."""
+    scaled = up(q, 2 * BITS) * (1 << 2 * BITS)
+    return Q(math.isqrt(int(scaled.numerator)) + 1, 1 << BITS)
+
+
+def alternating(x, k: int):
+    """sum_i (-1)^i x^(k+2i) / (k+2i)!, the sine (k = 1) or cosine (k = 0), and a bound of the error; |x| <= 64."""
+    term = x**k
+    total = term
+    while abs(term) > Q(1, 1 << (BITS + 8)) or k < abs(x):
+        k += 2
+        term, _ = near(-term * x * x / Q(k * (k - 1)), 2 * BITS)
+        total += term
+    return near(total)[0], Q(1, 1 << (BITS - 2))

@@ -1,0 +1,174 @@
+"""Positive on the sphere: a sum of squares in exact numbers, by Bernstein polynomials in the time."""
+
+import math
+from collections.abc import Sequence
+from functools import lru_cache
+from itertools import combinations_with_replacement
+from typing import Any, NamedTuple
+
+from rtcd_jax.certificate.check.exact import Q, insist
+from rtcd_jax.certificate.check.taylor import peak, terms_of
+
+
+class Obligation(NamedTuple):
+    """To show: q > 0 wherever |y| = 1, s in [low, high] and all of `where` >= 0; q is `p` up to `error`.
+
+    `drift` bounds what does not vanish with l, at the goal: its error is error + drift / l there.
+    """
+
+    p: Any
+    error: Any
+    drift: Any
+    where: list
+    low: Any
+    high: Any
+
+
+class Witness(NamedTuple):
+    """`gram` [j] and `multipliers` [i][a], symmetric matrices, with monomials of y up to `degree` and `degree` - 1."""
+
+    degree: int
+    gram: list
+    multipliers: list
+
+
+@lru_cache(None)
+def monomials(n: int, degree: int) -> tuple[tuple[int, ...], ...]:
+    """Exponents of y up to `degree`, by degree; on the sphere the last component needs no square."""
+    found = []
+    for order in range(degree + 1):
+        for chosen in combinations_with_replacement(range(n), order):
+            exponents = tuple(chosen.count(i) for i in range(n))
+            if exponents[-1] < 2:
+                found.append(exponents)
+    return tuple(found)
+
+
+@lru_cache(None)
+def reduced(exponents: tuple[int, ...]) -> tuple[tuple[tuple[int, ...], int], ...]:
+    """y^exponents on the sphere: y_n^2 = 1 - y_1^2 - ... - y_{n-1}^2."""
+    if exponents[-1] < 2:
+        return ((exponents, 1),)
+    rest = (*exponents[:-1], exponents[-1] - 2)
+    total = dict(reduced(rest))
+    for i in range(len(exponents) - 1):
+        for e, c in reduced(tuple(a + 2 * (i == j) for j, a in enumerate(rest))):
+            total[e] = total.get(e, 0) - c
+    return tuple(total.items())
+
+
+@lru_cache(1000)
+def _basis_change(order: int, degree: int, low, high) -> tuple:
+    """Row k: s^k in the Bernstein polynomials of `degree` on [low, high]."""
+    rows, width = [], high - low
+    for k in range(order + 1):
+        powers = [math.comb(k, i) * low ** (k - i) * width**i for i in range(k + 1)]
+        rows.append([sum((p * Q(math.comb(j, i), math.comb(degree, i)) for i, p in enumerate(powers[: j + 1])), Q(0))
+                     for j in range(degree + 1)])  # fmt: skip
+    return tuple(rows)
+
+
+def bernstein(p, degree: int, low, high, place: str) -> list[dict]:
+    """Bernstein coefficients in s, each a polynomial in y on the sphere by exponents."""
+    terms = terms_of(p)
+    order = max((e[0] for e, _ in terms), default=0)
+    insist(order <= degree, place, f"order {order} in time needs more than {degree + 1} Bernstein polynomials")
+    rows, parts = _basis_change(order, degree, low, high), [{} for _ in range(degree + 1)]
+    for e, c in terms:
+        for f, k in reduced(e[1:]):
+            for part, weight in zip(parts, rows[e[0]], strict=True):
+                part[f] = part.get(f, 0) + c * k * weight
+    return parts
+
+
+def is_positive_definite(matrix: Sequence[Sequence]) -> bool:
+    """By Sylvester's criterion: all leading minors, from Bareiss' elimination in integers."""
+    entries = [c for row in matrix for c in row]
+    common = math.lcm(*(int(c.denominator) for c in entries))
+    a = [[int(c.numerator) * (common // int(c.denominator)) for c in row] for row in matrix]
+    before = 1
+    for k in range(len(a)):
+        pivot = a[k][k]
+        if pivot <= 0:
+            return False
+        for i in range(k + 1, len(a)):
+            left = a[i][k]
+            for j in range(i, len(a)):
+                a[i][j] = a[j][i] = (pivot * a[i][j] - left * a[k][j]) // before
+        before = pivot
+    return True
+
+
+def quadratic(matrix: Sequence[Sequence], basis: Sequence[tuple[int, ...]]) -> dict:
+    """z'M z on the sphere, z the monomials of the basis."""
+    total: dict = {}
+    for i, e in enumerate(basis):
+        for j in range(i, len(basis)):
+            c = matrix[i][j] * (1 + (i != j))
+            for f, k in reduced(tuple(map(sum, zip(e, basis[j], strict=True)))):
+                total[f] = total.get(f, 0) + c * k
+    return total
+
+
+def margin(todo: Obligation, witness: Witness, place: str):
+    """A lower bound > 0 of q where the obligation asks for it.
+
+    Raises:
+        Refused: the witness does not show that.
+    """
+    n = len(next(iter(peakless(todo.p)))) - 1
+    basis, sides = monomials(n, witness.degree), monomials(n, witness.degree - 1)
+    degree = len(witness.gram) - 1
+    parts = bernstein(todo.p, degree, todo.low, todo.high, place)
+    insist(len(witness.multipliers) == len(todo.where), place, f"needs {len(todo.where)} multipliers")
+    for i, (g, multiplier) in enumerate(zip(todo.where, witness.multipliers, strict=True)):
+        _subtract_product(parts, g, multiplier, sides, todo, f"{place}.multipliers[{i}]")
+    bound = None
+    for j, (part, gram) in enumerate(zip(parts, witness.gram, strict=True)):
+        _insist_definite(gram, len(basis), f"{place}.gram[{j}]")
+        for e, c in quadratic(gram, basis).items():
+            part[e] = part.get(e, 0) - c
+        rest = part.pop((0,) * n, Q(0)) - sum((abs(c) * peak(e) for e, c in part.items()), Q(0)) - todo.error
+        insist(rest > 0, f"{place}.gram[{j}]", f"proves no decrease: at best {float(rest):.3g}, must be > 0")
+        bound = rest if bound is None else min(bound, rest)
+    return bound
+
+
+def peakless(p):
+    """Exponents of a polynomial that is not zero."""
+    return p.to_dict() or {(0, 0): 0}
+
+
+def _insist_definite(matrix, rows: int, place: str) -> None:
+    insist(len(matrix) == rows, place, f"has {len(matrix)} rows, must have {rows}")
+    insist(is_positive_definite(matrix), place, "is not positive definite")
+
+
+def _subtract_product(parts, g, multiplier, basis, todo: Obligation, place: str) -> None:
+    """Takes sigma g from the Bernstein coefficients, sigma = sum_a B_a z'S_a z."""
+    degree, high = len(parts) - 1, len(multiplier) - 1
+    insist(0 <= high <= degree, place, f"has {high + 1} matrices, must have 1 to {degree + 1}")
+    factors = bernstein(g, degree - high, todo.low, todo.high, place)
+    for a, matrix in enumerate(multiplier):
+        _insist_definite(matrix, len(basis), f"{place}[{a}]")
+        square = quadratic(matrix, basis)
+        for b, factor in enumerate(factors):
+            weight = Q(math.comb(high, a) * math.comb(degree - high, b), math.comb(degree, a + b))
+            part = parts[a + b]
+            for e, c in square.items():
+                for f, d in factor.items():
+                    for h, k in reduced(tuple(map(sum, zip(e, f, strict=True)))):
+                        part[h] = part.get(h, 0) - weight * c * d * k
+
+
+def is_positive(coefficients: list, low, high, depth: int = 10) -> bool:
+    """Whether a polynomial in s is shown to be positive on [low, high], by Bernstein coefficients and bisection."""
+    degree = len(coefficients) - 1
+    rows = _basis_change(degree, degree, low, high)
+    values = [sum((c * row[j] for c, row in zip(coefficients, rows, strict=True)), Q(0)) for j in range(degree + 1)]
+    if min(values) > 0:
+        return True
+    if depth == 0 or values[0] <= 0 or values[-1] <= 0:
+        return False
+    middle = (low + high) / 2
+    return is_positive(coefficients, low, middle, depth - 1) and is_positive(coefficients, middle, high, depth - 1)

@@ -1,0 +1,169 @@
+"""The whole: every obligation of a certificate shown, and what that proves."""
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from rtcd_jax.certificate.check.claim import Claim
+from rtcd_jax.certificate.check.exact import Q, Refused, insist, root_up
+from rtcd_jax.certificate.check.file import Node, parse, read_claim, read_goal, read_stretch
+from rtcd_jax.certificate.check.funnel import Stretch, funnel_obligations, insist_bounds, motion
+from rtcd_jax.certificate.check.goal import goal_field, goal_obligations, insist_arrival
+from rtcd_jax.certificate.check.scalar import cofactors, constants, norm_squared
+from rtcd_jax.certificate.check.squares import Obligation, Witness, margin
+
+FORMAT, VERSION = "rtcd certificate", 1
+
+
+class Report(NamedTuple):
+    """What an accepted certificate proves, rounded: volumes in the product of the states' units, times in s."""
+
+    claim: Claim
+    stretches: int
+    shells: int
+    start: float
+    end: float
+    volumes: dict[str, float]
+    axes: dict[str, list[float]]
+    rest: list[float]
+    margin: float
+    notes: dict[str, str]
+
+
+def margins(todo: Mapping[str, Obligation], cases: Mapping[str, Witness], place: str) -> dict[str, Any]:
+    """Margin by case; refused unless there is a witness for exactly the cases that can occur."""
+    insist(todo.keys() == cases.keys(), place, f"must have the cases {', '.join(todo)}, has {', '.join(cases)}")
+    return {case: margin(todo[case], cases[case], f"{place}.{case}") for case in todo}
+
+
+def check_stretch(claim: Claim, piece: Stretch, place: str):
+    """The margin of one interval's proof."""
+    insist_bounds(claim, motion(claim, piece), place)
+    return min(margins(funnel_obligations(claim, piece, place), piece.cases, f"{place}.cases").values())
+
+
+def check_chain(claim: Claim, pieces: Sequence[Stretch], place: str) -> None:
+    """The intervals cover [start, t_N] without gap or overlap, and their ellipsoids join."""
+    reached, axes = claim.start, None
+    for i, piece in enumerate(pieces):
+        here, at, begins = f"{place}[{i}]", reached[0] + reached[1], piece.knot + piece.start
+        where = f"starts at {float(begins):.17g} knots, must start at {float(at):.17g}"
+        insist(begins <= at, here, f"leaves a gap: {where}")
+        insist(begins == at, here, f"overlaps: {where}")
+        insist(axes is None or axes == piece.first, f"{here}.first", "is not where the interval before it ends")
+        reached, axes = (piece.knot, piece.end), piece.last
+    insist(reached[0] + reached[1] == len(claim.u), place, "does not reach the last knot")
+
+
+def check_goal(claim: Claim, node: Node, outlet: list) -> tuple[list, list, int, Any]:
+    """Axes of the goal region, how close motions come [n], the number of shells and the least margin."""
+    axes, order, weight, shells = read_goal(node, claim)
+    for i, bound in enumerate(claim.bounds):
+        left = None if bound is None else bound - abs(claim.x_goal[i])
+        kept = left is None or (left > 0 and left * left > norm_squared([[c] for c in axes[i]])[0])
+        insist(kept, f"{node.place}.axes", f"the limit on |{claim.plant.states[i]}| is not kept")
+    field = goal_field(claim, axes, order, node.place)
+    insist_arrival(claim, outlet, axes, weight, f"{node.place}.axes")
+    least, drift = None, Q(0)
+    for i, shell in enumerate(shells):
+        todo = goal_obligations(claim, field, shell.start, shell.end)
+        found = min(margins(todo, shell.cases, f"{node.place}.shells[{i}].cases").values())
+        least = found if least is None else min(least, found)
+        drift = max(drift, *(each.drift for each in todo.values()))
+    rest = drift / least
+    insist(rest < 1, node.place, "the rounding of the goal is too large for a proof")
+    return axes, [rest * root_up(norm_squared([[c] for c in row])[0]) for row in axes], len(shells), least
+
+
+def check(content: Any, progress: Callable[[int, int], None] = lambda done, of: None) -> Report:
+    """What the parsed certificate proves.
+
+    Raises:
+        Refused: it proves nothing, with the place and the reason.
+    """
+    top = Node("certificate", content)
+    top.insist(isinstance(content, dict), "must be an object")
+    top.insist(content.get("format") == FORMAT, f"is no {FORMAT!r}")
+    top.insist(type(content.get("version")) is int and content["version"] == VERSION, f"must be of version {VERSION}")
+    _, _, about, funnel, goal, notes = top.keys("format", "version", "claim", "funnel", "goal", "notes")
+    claim = read_claim(about)
+    pieces = [read_stretch(item, claim) for item in funnel.items(at_least=1)]
+    check_chain(claim, pieces, funnel.place)
+    l_goal, rest, shells, least = check_goal(claim, goal, pieces[-1].last)
+    for i, piece in enumerate(pieces):
+        least = min(least, check_stretch(claim, piece, f"{funnel.place}[{i}]"))
+        progress(i + 1, len(pieces))
+    notes.insist(isinstance(notes.value, dict), "must be an object")
+    top.sealed()
+    volumes, axes = volumes_of(claim, pieces, l_goal)
+    begin = float((claim.start[0] + claim.start[1]) * claim.dt)
+    return Report(
+        claim, len(pieces), shells, begin, float(len(claim.u) * claim.dt), volumes, axes,
+        [float(r) for r in rest], float(least), {str(k): str(v) for k, v in notes.value.items()},
+    )  # fmt: skip
+
+
+def volumes_of(
+    claim: Claim, pieces: Sequence[Stretch], l_goal: list
+) -> tuple[dict[str, float], dict[str, list[float]]]:
+    """Volumes |unit ball| det L, and half widths of the ellipsoids along each state."""
+    ball = math.pi ** (claim.n / 2) / math.gamma(claim.n / 2 + 1)
+
+    def volume(axes) -> float:
+        return ball * float(cofactors(constants(axes))[1][0])
+
+    def widths(axes) -> list[float]:
+        return [float(root_up(norm_squared([[c] for c in row])[0])) for row in axes]
+
+    knots = [volume(piece.first) for piece in pieces if piece.start == 0] + [volume(pieces[-1].last)]
+    integral = Q(0)
+    for piece in pieces:
+        data = motion(claim, piece)
+        determinant = cofactors(data.axes)[1]
+        integral += sum((c / (k + 1) for k, c in enumerate(determinant) if k % 2 == 0), Q(0)) * data.duration
+    volumes = {
+        "sum": math.fsum(knots), "integral": ball * float(integral), "inlet": volume(pieces[0].first),
+        "outlet": knots[-1], "goal": volume(l_goal),
+    }  # fmt: skip
+    return volumes, {"inlet": widths(pieces[0].first), "outlet": widths(pieces[-1].last), "goal": widths(l_goal)}
+
+
+def sentence(name: str, report: Report) -> str:
+    """What is proved, in plain words."""
+    claim, plant, v = report.claim, report.claim.plant, report.volumes
+    numbers = ", ".join(f"{key} = {float(value):.6g}" for key, value in claim.parameters.items())
+    unit = " ".join(plant.units)
+
+    def extent(place: str) -> str:
+        triples = zip(plant.states, report.axes[place], plant.units, strict=True)
+        return f"{place} " + ", ".join(f"{state} +-{value:.3g} {unit}" for state, value, unit in triples)
+
+    limits = [(s, b, u) for s, b, u in zip(plant.states, claim.bounds, plant.units, strict=True) if b is not None]
+    kept = " and ".join(f"|{state}| <= {float(bound):.6g} {unit}" for state, bound, unit in limits)
+    return (
+        f"PROVED in continuous time, by exact arithmetic, for the model {name!r} ({numbers}; SI units) under the "
+        f"claimed controller, whose input never exceeds {float(claim.limit):.6g} {plant.input_unit}: every motion that "
+        f"is in the funnel at some time of [{report.start:.6g} s, {report.end:.6g} s] stays in it, is in the goal "
+        f"region at {report.end:.6g} s, never leaves that region, and comes and stays within "
+        f"{max(report.rest):.1g} of the goal in every state; {kept or 'there is no limit on a state'} all the while. "
+        f"Half widths: {extent('inlet')}; {extent('outlet')}; {extent('goal')}. Volumes (proved) [{unit}]: inlet "
+        f"{v['inlet']:.6g}, sum over the knots {v['sum']:.6g}, integral over time {v['integral']:.6g} s, goal region "
+        f"{v['goal']:.6g}. {report.stretches} intervals of time and {report.shells} of level, smallest margin "
+        f"{report.margin:.2g}. It is a statement about this model, its state known and its input continuous, not about "
+        "hardware."
+    )
+
+
+def check_file(path: Path, progress: Callable[[int, int], None] = lambda done, of: None) -> Report:
+    """`check` of a file.
+
+    Raises:
+        Refused: as `check`.
+        OSError: the file cannot be read.
+    """
+    try:
+        text = path.read_bytes().decode("ascii")
+    except UnicodeDecodeError:
+        raise Refused("certificate", "is no ASCII text") from None
+    return check(parse(text), progress)

@@ -1,0 +1,109 @@
+"""The goal region of the saturated pendulum beside a fine grid of simulations and beside a closed form."""
+
+import numpy as np
+import pytest
+from scipy.linalg import expm, solve_continuous_are
+
+from rtcd_jax.certificate import check
+from rtcd_jax.certificate.goal import goal_region
+from rtcd_jax.certificate.loop import Loop, claim_of, double, sealed
+from tests.certificate import swing
+from tests.certificate.loops import Simulated
+
+PAPER = {"m": 0.7, "l": 0.4, "b": 0.1, "g": 9.81, "torque_limit": 2.5}
+OTHER = {"m": 0.676, "l": 0.45, "b": 0.1, "g": 9.81, "torque_limit": 2.0}
+GRID = 101
+
+
+class Upright:
+    """A pendulum's LQR about the upright, and the goal region that is proved without limits on the states."""
+
+    def __init__(self, parameters, q, r):
+        self.parameters, inertia = parameters, parameters["m"] * parameters["l"] ** 2
+        a = np.array([[0, 1], [parameters["g"] / parameters["l"], -parameters["b"] / inertia]])
+        b = np.array([[0], [1 / inertia]])
+        self.S = solve_continuous_are(a, b, np.diag(q), [[r]])
+        self.K = b.T @ self.S / r
+        self.linear, self.limit = a - b @ self.K, parameters["torque_limit"]
+        arrays = {
+            "time": np.array([0, 0.05]), "x": np.array([swing.UPRIGHT] * 2), "u": np.zeros((1, 1)),
+            "K": np.array([self.K] * 2), "S": np.array([self.S] * 2), "Q": np.diag(q), "R": np.array([[r]]),
+            "K_goal": self.K, "x_goal": swing.UPRIGHT, "u_max": np.array([self.limit]),
+        }  # fmt: skip
+        told = claim_of(arrays, {"plant": "pendulum", "parameters": parameters, "state_limits": [None, None]})
+        claim = check.read_claim(check.Node("claim", sealed({**told, "start": [0, double(0.0)]})))
+        region = goal_region(claim, Loop(claim, arrays), exact=True)
+        assert region is not None
+        self.rho = region.rho
+
+    def area(self, level):
+        """Of {V <= level}."""
+        return np.pi * level / np.sqrt(np.linalg.det(self.S))
+
+    def grid(self, width=1.5):
+        """Errors [2 M] all over a box around the region, and the area of a cell."""
+        half = width * np.sqrt(self.rho * np.diag(np.linalg.inv(self.S)))
+        sides = [np.linspace(-h, h, GRID) for h in half]
+        return np.stack(np.meshgrid(*sides)).reshape(2, -1), np.prod(2 * half / (GRID - 1))
+
+    def value(self, error):
+        return np.sum(error * (self.S @ error), axis=0)
+
+    def rate(self, error):
+        u = np.clip(-self.K @ error, -self.limit, self.limit)[0]
+        return swing.rate(swing.UPRIGHT[:, None] + error, u, self.parameters)
+
+    def arrive(self, error, duration=8.0, step=0.01):
+        for _ in range(round(duration / step)):
+            error = Simulated._step(lambda x, _: self.rate(x), error, 0.0, step)
+        return self.value(error) < 1e-3 * self.rho
+
+    def never_saturated(self, error):
+        """Where the linear loop's own input stays within the limit for all time, and the motor holds what the sine is
+        short of the angle (Gross et al., CDC 2022).
+
+        With two real modes the input has one extremum at most, here looked for on a fine grid of times.
+        """
+        p = self.parameters
+        near = np.abs(error[0] - np.sin(error[0])) < self.limit / (p["m"] * p["g"] * p["l"])
+        assert np.all(np.isreal(np.linalg.eigvals(self.linear)))
+        inputs = [np.abs(self.K @ expm(t * self.linear) @ error) for t in np.linspace(0, 2, 400)]
+        return near & (np.max(inputs, axis=0)[0] <= self.limit)
+
+
+@pytest.fixture(scope="module", params=[(PAPER, (10.0, 1.0), 1.0), (OTHER, (1.0, 1.0), 1.0)], ids=["paper", "other"])
+def upright(request):
+    return Upright(*request.param)
+
+
+def test_it_lies_in_the_simulated_region_and_is_not_far_from_it(upright):
+    error, _ = upright.grid()
+    arrive, inside = upright.arrive(error), upright.value(error) <= upright.rho
+    assert inside.sum() > 2000
+    assert np.all(arrive[inside])
+    assert upright.value(error)[~arrive].min() < 1.5 * upright.rho
+
+
+def test_it_is_the_largest_on_which_the_value_falls(upright):
+    """Within the resolution of the levels that are tried; above it, V rises somewhere on its boundary."""
+    angle = np.linspace(0, 2 * np.pi, 2000)
+    circle = np.linalg.cholesky(np.linalg.inv(upright.S)) @ np.stack([np.cos(angle), np.sin(angle)])
+
+    def rises(level):
+        error = np.sqrt(level) * circle
+        return np.max(np.sum((upright.S @ error) * upright.rate(error), axis=0)) > 0
+
+    assert not rises(upright.rho)
+    assert rises(1.04 * upright.rho)
+
+
+def test_the_closed_form_of_the_unsaturated_loop_arrives_and_is_smaller(upright):
+    """It is no ellipse, and no proof for the true sine; the proved region has saturated states that it lacks."""
+    error, cell = upright.grid(4.0)
+    closed = upright.never_saturated(error)
+    assert np.all(upright.arrive(error[:, closed]))
+    assert not np.any(closed[np.abs(error[0]) >= error[0].max() * (1 - 1e-9)])  # the grid is wide enough
+    assert 1.05 < upright.area(upright.rho) / (closed.sum() * cell) < 1.3
+    assert np.mean(closed[upright.value(error) <= upright.rho]) < 0.6
+    alone = upright.limit**2 / float((upright.K @ np.linalg.inv(upright.S) @ upright.K.T)[0, 0])
+    assert upright.rho > 2 * alone  # the largest ellipse of the same shape without saturation

@@ -1,0 +1,114 @@
+"""Several processes on JAX's own runtime: one result, whoever is killed or asked to stop, and however it goes on."""
+
+import re
+import signal
+import socket
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from rtcd_jax.cli import LOST_PROCESS, PREEMPTED
+from tests.test_storage import driver, end, results
+
+ROOT = Path(__file__).parents[1]
+SLOWLY = 0.15
+
+
+def start(path, seconds=0.0, devices=1, processes=2):
+    """The processes of one run, each with as many devices, talking over the loopback."""
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    words = [str(word) for word in (path, "joint", seconds, devices, port, processes)]
+    return [
+        subprocess.Popen(
+            [sys.executable, "-m", "tests.killable", *words, str(index)],
+            cwd=ROOT,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+        )
+        for index in range(processes)
+    ]
+
+
+def after(process, generation):
+    """Waits for a generation's line."""
+    for line in process.stdout:
+        if line == f"generation {generation}\n":
+            return
+    raise AssertionError(f"it ended before generation {generation}")
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    """Results of an uninterrupted run of one process on one device."""
+    path = tmp_path_factory.mktemp("whole") / "run"
+    output = end(driver(path, "joint"))
+    assert output.endswith("done\n"), output
+    return results(path)
+
+
+def finished_by_one(path, devices):
+    output = end(driver(path, "joint", 0.0, devices))
+    assert output.endswith("done\n"), output
+    return int(re.search(r"^from (\d+)$", output, re.MULTILINE).group(1))
+
+
+def test_two_processes_end_with_the_bytes_of_one(tmp_path, whole):
+    outputs = [end(process) for process in start(tmp_path / "run")]
+    assert all(output.endswith("done\n") for output in outputs), outputs
+    assert results(tmp_path / "run") == whole
+
+
+@pytest.mark.parametrize("victim", [pytest.param(0, marks=pytest.mark.slow), 1])
+def test_if_one_is_killed_the_other_ends_soon_and_the_run_goes_on_exactly(tmp_path, whole, victim):
+    """Process 0 holds the others together: without it they may be ended by JAX's runtime itself."""
+    processes = start(tmp_path / "run", SLOWLY)
+    after(processes[victim], 4)
+    processes[victim].kill()
+    output = end(processes[1 - victim])
+    ends = {1: (LOST_PROCESS,), 0: (LOST_PROCESS, -signal.SIGABRT)}[victim]
+    assert processes[1 - victim].returncode in ends, output
+    assert "lost another process of this run" in output or "another task died" in output
+    end(processes[victim])
+    again = [end(process) for process in start(tmp_path / "run")]
+    assert all(output.endswith("done\n") for output in again), again
+    assert results(tmp_path / "run") == whole
+
+
+@pytest.mark.parametrize("devices", [pytest.param(1, marks=pytest.mark.slow), 4])
+def test_asked_to_stop_both_save_and_leave_and_one_process_goes_on_exactly(tmp_path, whole, devices):
+    """On one device, or on four."""
+    processes = start(tmp_path / "run", SLOWLY)
+    after(processes[1], 4)
+    processes[1].send_signal(signal.SIGTERM)
+    outputs = [end(process) for process in processes]
+    assert [process.returncode for process in processes] == [PREEMPTED, PREEMPTED], outputs
+    (done,) = {int(re.search(r"^preempted (\d+)$", output, re.MULTILINE).group(1)) for output in outputs}
+    assert 4 < done < 24
+    assert finished_by_one(tmp_path / "run", devices) == done
+    assert results(tmp_path / "run") == whole
+
+
+def test_asked_to_stop_a_process_alone_saves_and_leaves(tmp_path, whole):
+    process = driver(tmp_path / "run", "joint", SLOWLY)
+    after(process, 3)
+    process.send_signal(signal.SIGTERM)
+    output = end(process)
+    assert process.returncode == PREEMPTED, output
+    done = int(re.search(r"^preempted (\d+)$", output, re.MULTILINE).group(1))
+    assert finished_by_one(tmp_path / "run", 2) == done
+    assert results(tmp_path / "run") == whole
+
+
+def test_processes_with_different_configurations_are_refused(tmp_path):
+    processes = start(tmp_path / "run")
+    other = [*processes[1].args[:4], "nested", *processes[1].args[5:]]
+    processes[1].kill()
+    processes[1].communicate()
+    processes[1] = subprocess.Popen(other, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+    outputs = [end(process) for process in processes]
+    assert all("started with different values of: configuration" in output for output in outputs), outputs
