@@ -24,7 +24,7 @@ LAYERS = (
     {"cmaes", "elites", "loops"},
     {"search"},
     {"storage"},
-    {"verify", "options", "certificate", "report"},
+    {"verify", "options", "reference", "certificate", "report"},
     {"export", "disturb"},
     {"run"},
     {"cli"},
@@ -44,7 +44,7 @@ OWNERS = {
     "matplotlib": {"report"},
     "PIL": {"report"},
     "imageio_ffmpeg": {"report"},
-    "pydantic": {"settings", "config", "options"},
+    "pydantic": {"settings", "config", "options", "reference"},
     "pydantic_core": {"settings"},
 }
 
