@@ -14,9 +14,14 @@ from rtcd_jax.plants.base import ModelEdits
 _PLACES = {
     "body_mass": ("body", "inertial", "mass"),
     "body_ipos": ("body", "inertial", "pos"),
+    "body_iquat": ("body", "inertial", "quat"),
     "body_inertia": ("body", "inertial", "diaginertia"),
+    "body_pos": ("body", ".", "pos"),
+    "body_quat": ("body", ".", "quat"),
     "dof_damping": ("joint", ".", "damping"),
+    "dof_armature": ("joint", ".", "armature"),
     "geom_pos": ("geom", ".", "pos"),
+    "geom_quat": ("geom", ".", "quat"),
     "geom_size": ("geom", ".", "size"),
 }
 """Where an attribute of the model stands in an MJCF: the element by name, the path from there, the XML's attribute."""
