@@ -131,7 +131,7 @@ def _parameters(bundle: Bundle, described: Mapping[str, Any]) -> str:
 def _summary(bundle: Bundle, target: Path, again: bool) -> Iterator[str]:
     plant, rung, certificate = bundle.elite.plant, bundle.record["rung"], bundle.certificate
     verb = "replaces the former export" if again else "is"
-    yield f"elite {bundle.name}, a {plant} with a {rung} funnel, {verb} in {target}"
+    yield f"{plant}, elite {bundle.name} with its {rung} funnel, {verb} in {target}"
     if certificate:
         yield f"certificate: rung {certificate['rung'] or 'unknown'}, in {target / 'certificate.json'}"
     else:
