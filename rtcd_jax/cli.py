@@ -9,7 +9,7 @@ import os
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import NoReturn
+from typing import Any, NoReturn
 
 from rtcd_jax.errors import UserError, closest
 
@@ -29,20 +29,61 @@ def optimize(arguments: Sequence[str]) -> int:
     from rtcd_jax.options import read_optimize
 
     config, options = read_optimize(arguments, RUNS)
-    _prepare_jax(options.cpu_devices)
+
+    def run(console, cluster) -> None:
+        from rtcd_jax.run import optimize as run_optimize
+
+        run_optimize(config, options.run, console, cluster)
+
+    return _on_cluster(options.machines, options.run, run)
+
+
+def sweep(arguments: Sequence[str]) -> int:
+    """make all the runs that a YAML's sweep section asks for, or one of them"""
+    from rtcd_jax.options import read_sweep
+    from rtcd_jax.sweep import show
+
+    cases, options = read_sweep(arguments, RUNS)
+    if options.list:
+        print(show(cases, options.folder))
+        return OK
+
+    def run(console, cluster) -> None:
+        from rtcd_jax.run import optimize as run_optimize
+
+        failed = []
+        for case in cases if options.case is None else [cases[options.case]]:
+            console.message(f"case {case.number} of 0 … {len(cases) - 1}: {case.folder}")
+            try:
+                run_optimize(case.config, case.folder, console, cluster)
+            except UserError as error:  # the others may do better
+                console.message(f"case {case.number} ended early: {error}")
+                failed.append(case.folder.name)
+        cluster.on_first(lambda: console.message(show(cases, options.folder)))
+        if failed:
+            raise UserError(f"{len(failed)} of the cases ended early, see above: {', '.join(failed)}")
+
+    return _on_cluster(options.machines, options.folder, run)
+
+
+def _on_cluster(machines: Any, folder: Path, run: Callable[[Any, Any], None]) -> int:
+    """Joins the other processes of `machines`, if any, and runs `run(console, cluster)`; the exit code.
+
+    What ends early leaves the process at once.
+    """
+    _prepare_jax(machines.cpu_devices)
     from rtcd_jax.cluster import Cluster, Lost, Preempted, join, part
 
-    join(options.coordinator, options.num_processes, options.process_id)  # before any import that touches a device
+    join(machines.coordinator, machines.num_processes, machines.process_id)  # before anything touches a device
     from rtcd_jax.console import Console, silent
-    from rtcd_jax.run import optimize as run_optimize
 
-    cluster = Cluster.of(options.devices)
+    cluster = Cluster.of(machines.devices)
     cluster.heed()
     with Console() if cluster.first else silent() as console:
         try:
-            run_optimize(config, options.run, console, cluster)
+            run(console, cluster)
         except Preempted:
-            console.message(f"asked to stop (SIGTERM): saved in {options.run}; the same command goes on")
+            console.message(f"asked to stop (SIGTERM): saved in {folder}; the same command goes on")
             part()
             _leave(PREEMPTED)
         except Lost as error:
@@ -73,7 +114,7 @@ def verify(arguments: Sequence[str]) -> int:
     from rtcd_jax.verify import verify_run
 
     with Console() as console:
-        held = verify_run(options.run, options.states, options.seed, console)
+        held = verify_run(options.run, options.states, options.seed, options.workers or _cores(), console)
     return OK if held else BROKEN_PROMISE
 
 
@@ -195,6 +236,7 @@ def audit(arguments: Sequence[str]) -> int:
 
 VERBS: dict[str, Callable[[Sequence[str]], int]] = {
     "optimize": optimize,
+    "sweep": sweep,
     "verify": verify,
     "report": report,
     "animate": animate,

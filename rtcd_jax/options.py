@@ -12,6 +12,7 @@ from tyro.constructors import ConstructorRegistry, StructConstructorSpec, Struct
 from rtcd_jax.config import EXAMPLE, UNIT, Config, Variable, load, parse, parse_yaml
 from rtcd_jax.errors import UserError
 from rtcd_jax.settings import Settings, bounds
+from rtcd_jax.sweep import Case, read_cases
 
 _COORDINATOR = "where process 0 listens; srun and mpirun need none"
 POLICY_UNITS = {"authority": "-", "discount": "1/s"}
@@ -27,6 +28,32 @@ class Branch:
 
 
 @dataclass(frozen=True)
+class Machines:
+    """The devices of this process, and the other processes of its run."""
+
+    devices: Annotated[int | None, tyro.conf.arg(help="devices to use of those each process sees [-] (all)")] = None
+    cpu_devices: Annotated[int | None, tyro.conf.arg(help="parts the CPU is split into [-] (its cores)")] = None
+    coordinator: Annotated[str | None, tyro.conf.arg(metavar="HOST:PORT", help=_COORDINATOR)] = None
+    num_processes: Annotated[int | None, tyro.conf.arg(help="processes of this run [-] (known under srun)")] = None
+    process_id: Annotated[int | None, tyro.conf.arg(help="this one's number [-] (0 …, known under srun)")] = None
+
+    def require_sense(self) -> None:
+        """Raises `UserError` unless all of coordinator, number and id are given, or none, and all are in range."""
+        for name, least in (("devices", 1), ("cpu_devices", 1), ("num_processes", 1), ("process_id", 0)):
+            value = getattr(self, name)
+            if value is not None and value < least:
+                raise UserError(f"--{name} = {value}: must be >= {least}")
+        together = ("coordinator", "num_processes", "process_id")
+        missing = [f"--{name}" for name in together if getattr(self, name) is None]
+        if 0 < len(missing) < len(together):
+            raise UserError(
+                f"{', '.join(missing)}: must be given too; a process needs all of --{', --'.join(together)}"
+            )
+        if self.num_processes is not None and self.process_id is not None and self.process_id >= self.num_processes:
+            raise UserError(f"--process_id = {self.process_id}: must be < --num_processes = {self.num_processes}")
+
+
+@dataclass(frozen=True)
 class OptimizeOptions:
     """Search for the design and the weights with the largest funnel; the same command resumes a stopped run.
 
@@ -36,20 +63,37 @@ class OptimizeOptions:
     config: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="CONFIG", help="the experiment, a YAML file")]
     settings: Annotated[Branch, tyro.conf.arg(name="")]
     run: Annotated[Path, tyro.conf.arg(metavar="FOLDER", help="run folder, resumed if it is there")]
-    devices: Annotated[int | None, tyro.conf.arg(help="devices to use of those each process sees [-] (all)")] = None
-    cpu_devices: Annotated[int | None, tyro.conf.arg(help="parts the CPU is split into [-] (its cores)")] = None
-    coordinator: Annotated[str | None, tyro.conf.arg(metavar="HOST:PORT", help=_COORDINATOR)] = None
-    num_processes: Annotated[int | None, tyro.conf.arg(help="processes of this run [-] (known under srun)")] = None
-    process_id: Annotated[int | None, tyro.conf.arg(help="this one's number [-] (0 …, known under srun)")] = None
+    machines: Annotated[Machines, tyro.conf.arg(name="")] = Machines()
+
+
+@dataclass(frozen=True)
+class SweepOptions:
+    """Make every run that the `sweep` section of CONFIG asks for, one after another, each in a run folder of its own.
+
+    The same command goes on where an earlier one stopped. --case K makes one of them, as job arrays do; --list only
+    shows them. At the end a table of all cases is printed and stored as FOLDER/table.csv.
+
+    Example: rtcd sweep configs/sweep.yaml --list
+    """
+
+    config: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="CONFIG", help="a YAML with a sweep section")]
+    folder: Annotated[Path | None, tyro.conf.arg(help="of the run folders (checkpoints/NAME)")] = None
+    case: Annotated[int | None, tyro.conf.arg(help="number of the only one to run [-] (0 …)")] = None
+    list: Annotated[bool, tyro.conf.arg(help="show the cases and what is known of them, run nothing")] = False
+    machines: Annotated[Machines, tyro.conf.arg(name="")] = Machines()
 
 
 @dataclass(frozen=True)
 class VerifyOptions:
-    """Simulate fresh random states of a run's funnels with independent integrators; exit code 1 if too many fail."""
+    """Simulate fresh random states of a run's funnels with independent integrators; exit code 1 if too many fail.
+
+    The same command goes on after a stop. Example: rtcd verify checkpoints/pendulum_rtcd --states 100000
+    """
 
     run: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RUN", help="the run folder")]
     states: Annotated[int, tyro.conf.arg(help="fresh states, over the ellipsoids of all knots [-] (>= knots)")] = 1000
     seed: Annotated[int, tyro.conf.arg(help="of the states [-] (>= 0)")] = 0
+    workers: Annotated[int, tyro.conf.arg(help="processes, 0 for one a core [-] (>= 0)")] = 0
 
 
 @dataclass(frozen=True)
@@ -197,31 +241,27 @@ def read_optimize(arguments: Sequence[str], runs: Path) -> tuple[Config, Optimiz
     else:
         raise UserError(f"the configuration comes first, but found {arguments[0]!r}: {OPTIMIZE_USAGE}")
     options = _parse(arguments, OptimizeOptions(config=tyro.MISSING, settings=_config_branch(defaults), run=folder))
-    _require_processes(options)
+    options.machines.require_sense()
     return parse(options.settings, f"{options.config} with the options given"), options
 
 
-def _require_processes(options: OptimizeOptions) -> None:
-    """All of coordinator, number and id, or none of them."""
-    for name, smallest in (("devices", 1), ("cpu_devices", 1), ("num_processes", 1), ("process_id", 0)):
-        value = getattr(options, name)
-        if value is not None and value < smallest:
-            raise UserError(f"--{name} = {value}: must be >= {smallest}")
-    together = {name: getattr(options, name) for name in ("coordinator", "num_processes", "process_id")}
-    missing = [f"--{name}" for name, value in together.items() if value is None]
-    if 0 < len(missing) < len(together):
-        raise UserError(f"{', '.join(missing)}: must be given too; a process needs all of --{', --'.join(together)}")
-    if options.process_id is not None and options.process_id >= options.num_processes:
-        raise UserError(f"--process_id = {options.process_id}: must be < --num_processes = {options.num_processes}")
+def read_sweep(arguments: Sequence[str], runs: Path) -> tuple[list[Case], SweepOptions]:
+    """All cases of the sweep, and the options. Raises `UserError` for a wrong YAML or a case that is not there."""
+    options = tyro.cli(SweepOptions, args=arguments, prog="rtcd sweep", use_underscores=True)
+    options.machines.require_sense()
+    options = replace(options, folder=options.folder or runs / options.config.stem)
+    cases = read_cases(options.config, options.folder)
+    if options.case is not None and not 0 <= options.case < len(cases):
+        raise UserError(f"--case = {options.case}: must be one of 0 … {len(cases) - 1}")
+    return cases, options
 
 
 def read_verify(arguments: Sequence[str]) -> VerifyOptions:
     """The checked options of `rtcd verify`; `UserError` if one is out of range."""
     options = tyro.cli(VerifyOptions, args=arguments, prog="rtcd verify", use_underscores=True)
-    if options.states < 1:
-        raise UserError(f"--states = {options.states}: must be >= 1")
-    if options.seed < 0:
-        raise UserError(f"--seed = {options.seed}: must be >= 0")
+    for name, least in (("states", 1), ("seed", 0), ("workers", 0)):
+        if getattr(options, name) < least:
+            raise UserError(f"--{name} = {getattr(options, name)}: must be >= {least}")
     _require_run(options.run)
     return options
 

@@ -95,7 +95,7 @@ def test_help_shows_the_file_s_own_values(tmp_path):
 
 
 WRONG = {
-    "misspelt verb": (["optimise"], "unknown command 'optimise'; did you mean 'optimize'? Valid: optimize, verify"),
+    "misspelt verb": (["optimise"], "unknown command 'optimise'; did you mean 'optimize'? Valid: optimize, sweep"),
     "no file": (["optimize", "configs/pendulum_rtcdd.yaml"], "no such file; did you mean 'configs/pendulum_rtcd.yaml'"),
     "no arguments": (["optimize"], "Missing from rtcd optimize: CONFIG"),
     "option first": (["optimize", "--run", "x", RTCD], "the configuration comes first, but found '--run'"),
@@ -223,7 +223,7 @@ def test_a_bug_is_no_user_error(run_module):
 def test_verify_exits_by_the_promise(monkeypatch, tmp_path, held, code):
     calls = []
     module = types.ModuleType("rtcd_jax.verify")
-    module.verify_run = lambda folder, states, seed, console: calls.append((folder, states, seed)) or held
+    module.verify_run = lambda folder, states, seed, workers, console: calls.append((folder, states, seed)) or held
     monkeypatch.setitem(sys.modules, "rtcd_jax.verify", module)
     monkeypatch.setattr(cli, "_prepare_jax", lambda *_: None)
     assert cli.main(["verify", str(tmp_path), "--states", "10", "--seed", "3"]) == code

@@ -13,7 +13,7 @@ PACKAGE = Path(__file__).parent.parent / "rtcd_jax"
 LAYERS = (
     {"errors", "numerics", "files", "provenance"},
     {"settings", "types", "console"},
-    {"config"},
+    {"config", "sweep"},
     {"plants"},
     {"problem"},
     {"population", "trajectory", "policy", "rollout"},
@@ -38,7 +38,7 @@ OWNERS = {
     "flint": {"certificate"},
     "orbax": {"storage"},
     "evosax": {"cmaes"},
-    "rich": {"console", "verify", "certificate", "report"},
+    "rich": {"console", "sweep", "verify", "certificate", "report"},
     "tyro": {"options"},
     "yaml": {"config", "export"},
     "matplotlib": {"report"},

@@ -90,7 +90,7 @@ def _oracle(elite: Elite, k: int, x: np.ndarray) -> np.ndarray:
 
 def _outcomes(elite: Elite, knots, states):
     states = np.atleast_2d(np.asarray(states, float))
-    return [simulate(elite, f, march, np.asarray(knots), states) for _, f, march, _ in witnesses(elite, len(states))]
+    return [simulate(elite, f, march, np.asarray(knots), states) for _, f, march in witnesses(elite, len(states))]
 
 
 def test_a_small_funnel_about_the_upright_keeps_its_promise():
@@ -126,7 +126,7 @@ def test_the_witnesses_agree_on_every_state(level):
 def test_an_interval_under_the_loop_is_that_of_its_definition(witness, smooth, kinked):
     """The last state crosses the torque limit inside a step: there a method of any order is one of the second."""
     elite = _moving()
-    _, f, march, _ = list(witnesses(elite, 4))[witness]
+    _, f, march = list(witnesses(elite, 4))[witness]
     offsets = np.array([[0.0, 0.0], [0.05, -0.1], [-0.1, 0.2], [0.6, 1.0]])
     tolerances = np.array([smooth, smooth, smooth, kinked])[:, None]
     for k in range(len(elite.u)):
@@ -152,7 +152,7 @@ def test_mujocos_own_steps_with_held_inputs_converge_to_the_loop():
             mujoco.mj_step(model, data)
         return np.concatenate([data.qpos, data.qvel])
 
-    _, f, march, _ = next(witnesses(elite, 1))
+    _, f, march = next(witnesses(elite, 1))
     *_, end = march(tracking(elite, f, 0), 0.0, 0.05, x0[None])
     coarse, fine = (np.linalg.norm(stepped(steps) - end[0]) for steps in (200, 400))
     assert fine < 1e-3
@@ -242,12 +242,15 @@ class _Listener:
     def message(self, text: str) -> None:
         self.text += text + "\n"
 
+    def progress(self, now) -> None:
+        self.message(str(now))
+
 
 def _store(folder, name: str, elite: Elite, **changes) -> None:
     stored = dataclasses.asdict(elite)
     record = {key: stored.pop(key) for key in ("plant", "parameters", "epsilon", "confidence")}
     limits = [limit if np.isfinite(limit) else None for limit in stored.pop("state_limits")]
-    folder.mkdir(exist_ok=True)
+    folder.mkdir(parents=True, exist_ok=True)
     write_elite(folder, name, stored, record | {"state_limits": limits, "status": "OK"} | changes)
 
 
@@ -256,7 +259,7 @@ def test_verify_run_stores_what_it_found_and_tells_it(tmp_path):
     _store(tmp_path / "elites", "000", limited)
     _store(tmp_path, "initial", _held(100 * HELD))
     console = _Listener()
-    assert not verify_run(tmp_path, 60, 3, console)
+    assert not verify_run(tmp_path, 60, 3, 1, console)
     kept, broken = (json.loads((tmp_path / "verification" / f"{name}.json").read_text()) for name in ("000", "initial"))
     assert (kept["kept"], broken["kept"]) == (True, False)
     for record in (kept, broken):
@@ -274,7 +277,7 @@ def test_verify_run_reports_an_initial_candidate_without_a_funnel(tmp_path):
     _store(tmp_path / "elites", "000", _held(HELD))
     _store(tmp_path, "initial", _held(HELD), status="FUNNEL_EMPTY")
     console = _Listener()
-    assert verify_run(tmp_path, 60, 0, console)
+    assert verify_run(tmp_path, 60, 0, 1, console)
     assert "initial: nothing to verify, it has no funnel (FUNNEL_EMPTY)" in console.text
     assert not (tmp_path / "verification" / "initial.json").exists()
 
@@ -282,11 +285,53 @@ def test_verify_run_reports_an_initial_candidate_without_a_funnel(tmp_path):
 def test_chunks_do_not_change_a_verdict(monkeypatch):
     elite = _held(10 * HELD)
     whole = verify_funnel(elite, states=50).outcomes["closed form"]
-    monkeypatch.setattr("rtcd_jax.verify.STACKED", 7)
+    monkeypatch.setattr("rtcd_jax.verify.verification.CHUNK", 7)
     parts = verify_funnel(elite, states=50).outcomes["closed form"]
     assert whole.failed.any()
     for kind in ("left_funnel", "left_limits", "missed_goal"):
         np.testing.assert_array_equal(getattr(parts, kind), getattr(whole, kind))
+
+
+def test_a_stopped_verification_goes_on_and_ends_with_the_same_files(tmp_path, monkeypatch):
+    """On any number of processes; chunks of a funnel that has changed since are not taken."""
+    monkeypatch.setattr("rtcd_jax.verify.verification.CHUNK", 20)
+    for name in ("whole", "stopped"):
+        _store(tmp_path / name / "elites", "000", _held(10 * HELD))
+        _store(tmp_path / name, "initial", _held(HELD))
+    verify_run(tmp_path / "whole", 60, 3, 1, _Listener())
+
+    class Stopping(_Listener):
+        def progress(self, now) -> None:
+            if now.done == 5:
+                raise KeyboardInterrupt
+
+    folder = tmp_path / "stopped"
+    with pytest.raises(KeyboardInterrupt):
+        verify_run(folder, 60, 3, 1, Stopping())
+    console = _Listener()
+    verify_run(folder, 60, 3, 1, console)
+    assert "6/12 chunks" in console.text
+    assert "5/12 chunks" not in console.text
+    for name in ("000.json", "initial.json"):
+        whole, stopped = (tmp_path / run / "verification" / name for run in ("whole", "stopped"))
+        assert whole.read_bytes() == stopped.read_bytes()
+    assert sorted(path.name for path in (folder / "verification").iterdir()) == ["000.json", "initial.json"]
+    with pytest.raises(KeyboardInterrupt):
+        verify_run(folder, 60, 3, 1, Stopping())
+    _store(folder, "initial", _held(0.9 * HELD))
+    console = _Listener()
+    verify_run(folder, 60, 3, 1, console)
+    assert "6/12 chunks" in console.text
+
+
+def test_the_number_of_processes_changes_nothing(tmp_path):
+    _store(tmp_path / "elites", "000", _held(10 * HELD))
+    _store(tmp_path, "initial", _held(HELD))
+    found = []
+    for workers in (1, 2):
+        verify_run(tmp_path, 60, 3, workers, _Listener())
+        found.append([path.read_bytes() for path in sorted((tmp_path / "verification").iterdir())])
+    assert found[0] == found[1]
 
 
 def test_the_same_seed_gives_the_same_states():
@@ -297,12 +342,12 @@ def test_the_same_seed_gives_the_same_states():
 
 def test_verify_run_refuses_what_is_no_finished_run(tmp_path):
     with pytest.raises(UserError, match="nowhere is no run folder: it does not exist"):
-        verify_run(tmp_path / "nowhere", 60, 0, _Listener())
+        verify_run(tmp_path / "nowhere", 60, 0, 1, _Listener())
     with pytest.raises(UserError, match="has no elites yet: finish the run first"):
-        verify_run(tmp_path, 60, 0, _Listener())
+        verify_run(tmp_path, 60, 0, 1, _Listener())
     _store(tmp_path / "elites", "000", _held(HELD))
     with pytest.raises(UserError, match=r"has no initial\.npz"):
-        verify_run(tmp_path, 60, 0, _Listener())
+        verify_run(tmp_path, 60, 0, 1, _Listener())
 
 
 def test_too_few_states_for_the_knots_are_refused():

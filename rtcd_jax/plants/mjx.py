@@ -108,13 +108,13 @@ class MjxStepper(eqx.Module):
 
 
 class CpuDynamics:
-    """State derivatives of many states of one model by C MuJoCo, on all cores of this process.
+    """State derivatives of many states of one model by C MuJoCo, in one thread.
 
     It knows nothing of JAX: the independent witness of the closed form and of MJX.
     """
 
     def __init__(self, model: mujoco.MjModel, capacity: int):
-        self._batch = Batch(model, nsim=capacity)
+        self._batch = Batch(model, nsim=capacity, nthread=1)
         self._fields = tuple(self._batch.bind(name) for name in ("qpos", "qvel", "ctrl", "qacc"))
 
     def __call__(self, x: Float[np.ndarray, "states n"], u: Float[np.ndarray, "states m"]) -> np.ndarray:
