@@ -178,6 +178,34 @@ def certify(arguments: Sequence[str]) -> int:
     return OK if whole else BROKEN_PROMISE
 
 
+def export(arguments: Sequence[str]) -> int:
+    """write the controller, its funnel monitor and the design of an elite for a lab"""
+    from rtcd_jax.options import read_export
+
+    options = read_export(arguments)
+    prepare_jax()
+    from rtcd_jax.console import Console
+    from rtcd_jax.export import export_run
+
+    with Console() as console:
+        export_run(options.run, options.elite, options.to, console)
+    return OK
+
+
+def disturb(arguments: Sequence[str]) -> int:
+    """try a run's best elite and its initial candidate: off-nominal starts, pushes, wrong models, noise, delay"""
+    from rtcd_jax.options import read_disturb
+
+    options = read_disturb(arguments)
+    prepare_jax()
+    from rtcd_jax.console import Console
+    from rtcd_jax.disturb import disturb_run
+
+    with Console() as console:
+        disturb_run(options.run, options.states, options.seed, console)
+    return OK
+
+
 def check(arguments: Sequence[str]) -> int:
     """check a certificate file by exact arithmetic, without any solver"""
     from rtcd_jax.certificate.check import main as check_main
@@ -223,6 +251,8 @@ VERBS: dict[str, Callable[[Sequence[str]], int]] = {
     "animate": animate,
     "replay": replay,
     "certify": certify,
+    "disturb": disturb,
+    "export": export,
     "check": check,
     "falsify": falsify,
     "audit": audit,

@@ -227,6 +227,32 @@ class AuditOptions:
         return found
 
 
+@dataclass(frozen=True)
+class DisturbOptions:
+    """Try the initial candidate and the best elite: off-nominal starts, pushes, wrong models, noise, delay.
+
+    Example: rtcd disturb checkpoints/pendulum_rtcd --states 1000
+    """
+
+    run: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RUN", help="the run folder")]
+    states: Annotated[int, tyro.conf.arg(help="uniform states of every first ellipsoid [-] (>= 1)")] = 1000
+    seed: Annotated[int, tyro.conf.arg(help="of states, noise and perturbations [-] (>= 0)")] = 0
+
+
+@dataclass(frozen=True)
+class ExportOptions:
+    """Write an elite for a lab: controller and funnel monitor in Python and C, tables, MJCF and URDF.
+
+    Example: rtcd export checkpoints/pendulum_rtcd --to lab/pendulum
+    """
+
+    run: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RUN", help="the run folder")]
+    to: Annotated[Path, tyro.conf.arg(metavar="DIR", help="a new or empty folder, or a former export, to replace it")]
+    elite: Annotated[
+        int | Literal["initial"], tyro.conf.arg(metavar="K", help="0 is the best [-] (>= 0); or initial")
+    ] = 0
+
+
 def read_optimize(arguments: Sequence[str], runs: Path) -> tuple[Config, OptimizeOptions]:
     """The configuration with its overrides, and the options beside it.
 
@@ -310,6 +336,26 @@ def read_certify(arguments: Sequence[str]) -> CertifyOptions:
     for name in ("elites", "workers"):
         if getattr(options, name) < 1:
             raise UserError(f"--{name} = {getattr(options, name)}: must be >= 1")
+    _require_run(options.run)
+    return options
+
+
+def read_disturb(arguments: Sequence[str]) -> DisturbOptions:
+    """The checked options of `rtcd disturb`; `UserError` if one is out of range."""
+    options = tyro.cli(DisturbOptions, args=arguments, prog="rtcd disturb", use_underscores=True)
+    if options.states < 1:
+        raise UserError(f"--states = {options.states}: must be >= 1")
+    if options.seed < 0:
+        raise UserError(f"--seed = {options.seed}: must be >= 0")
+    _require_run(options.run)
+    return options
+
+
+def read_export(arguments: Sequence[str]) -> ExportOptions:
+    """The checked options of `rtcd export`; `UserError` if one is out of range."""
+    options = tyro.cli(ExportOptions, args=arguments, prog="rtcd export", use_underscores=True)
+    if isinstance(options.elite, int) and options.elite < 0:
+        raise UserError(f"--elite = {options.elite}: must be >= 0, or initial")
     _require_run(options.run)
     return options
 

@@ -24,7 +24,8 @@ LAYERS = (
     {"cmaes", "elites", "loops"},
     {"search"},
     {"storage"},
-    {"verify", "options", "certificate", "report"},
+    {"verify", "options", "reference", "certificate", "report"},
+    {"export", "disturb"},
     {"run", "scale"},
     {"cli"},
 )
@@ -39,11 +40,11 @@ OWNERS = {
     "evosax": {"cmaes"},
     "rich": {"console", "sweep", "scale", "verify", "certificate", "report"},
     "tyro": {"options"},
-    "yaml": {"config"},
+    "yaml": {"config", "export"},
     "matplotlib": {"report", "scale"},
     "PIL": {"report"},
     "imageio_ffmpeg": {"report"},
-    "pydantic": {"settings", "config", "options"},
+    "pydantic": {"settings", "config", "options", "reference"},
     "pydantic_core": {"settings"},
 }
 
