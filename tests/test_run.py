@@ -227,7 +227,7 @@ def test_fifty_kills_over_the_smoke_run_change_nothing(tmp_path):
     code, output, errors = smoke.optimize(folder)
     assert code == 0, output + errors
     assert _contents(folder) == _contents(whole)
-    assert not [path for path in folder.rglob(".*.tmp")]
+    assert not list(folder.rglob(".*.tmp"))
 
 
 def test_a_run_killed_while_it_stores_its_elites_stores_them_all(finished, small, tmp_path):
