@@ -11,17 +11,11 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NoReturn
 
+from rtcd_jax.backend import cores, prepare_jax
 from rtcd_jax.errors import UserError, closest
 
 OK, BROKEN_PROMISE, WRONG_INPUT, LOST_PROCESS, PREEMPTED, INTERRUPTED = 0, 1, 2, 75, 85, 130
 RUNS = Path("checkpoints")
-
-CPU_FLAGS = (
-    "--xla_cpu_prefer_vector_width=512",  # twice as fast with AVX-512
-    # Loops over knots are compiled whole: elsewhere every operation in them is a call of its own.
-    "--xla_backend_extra_options=xla_cpu_small_while_loop_byte_threshold=100000000",
-)
-"""XLA's options for the CPU."""
 
 
 def optimize(arguments: Sequence[str]) -> int:
@@ -71,7 +65,7 @@ def _on_cluster(machines: Any, folder: Path, run: Callable[[Any, Any], None]) ->
 
     What ends early leaves the process at once.
     """
-    _prepare_jax(machines.cpu_devices)
+    prepare_jax(machines.cpu_devices)
     from rtcd_jax.cluster import Cluster, Lost, Preempted, join, part
 
     join(machines.coordinator, machines.num_processes, machines.process_id)  # before anything touches a device
@@ -104,17 +98,31 @@ def _leave(code: int) -> NoReturn:
     os._exit(code)
 
 
+def scale(arguments: Sequence[str]) -> int:
+    """measure what a generation costs against population and devices"""
+    from rtcd_jax.options import read_scale
+
+    config, options = read_scale(arguments, RUNS)
+    from rtcd_jax.console import Console
+    from rtcd_jax.scale.study import study
+
+    grid = options.counts("populations"), options.counts("devices")
+    with Console() as console:
+        study(options.config, config, *grid, options.repeats, options.folder, console)
+    return OK
+
+
 def verify(arguments: Sequence[str]) -> int:
     """simulate fresh random states of a run's funnels with independent integrators"""
     from rtcd_jax.options import read_verify
 
     options = read_verify(arguments)
-    _prepare_jax()
+    prepare_jax()
     from rtcd_jax.console import Console
     from rtcd_jax.verify import verify_run
 
     with Console() as console:
-        held = verify_run(options.run, options.states, options.seed, options.workers or _cores(), console)
+        held = verify_run(options.run, options.states, options.seed, options.workers or cores(), console)
     return OK if held else BROKEN_PROMISE
 
 
@@ -135,7 +143,7 @@ def animate(arguments: Sequence[str]) -> int:
     from rtcd_jax.options import read_animate
 
     options = read_animate(arguments)
-    _prepare_jax()
+    prepare_jax()
     from rtcd_jax.console import Console
     from rtcd_jax.report.animate import animate_run
 
@@ -237,6 +245,7 @@ def audit(arguments: Sequence[str]) -> int:
 VERBS: dict[str, Callable[[Sequence[str]], int]] = {
     "optimize": optimize,
     "sweep": sweep,
+    "scale": scale,
     "verify": verify,
     "report": report,
     "animate": animate,
@@ -290,20 +299,3 @@ def _version() -> str:
     from importlib.metadata import version
 
     return f"rtcd {version('rtcd-jax')}"
-
-
-def _prepare_jax(cpu_devices: int | None = None) -> None:
-    """Double precision; XLA's options for the CPU; that many CPU devices, or one for each core this process may use."""
-    flags = os.environ.get("XLA_FLAGS", "")
-    ours = (flag for flag in CPU_FLAGS if flag.split("=")[0] not in flags)
-    os.environ["XLA_FLAGS"] = " ".join([flags, *ours]).strip()
-    import jax
-
-    jax.config.update("jax_enable_x64", True)
-    by_environment = "host_platform_device_count" in flags or "JAX_NUM_CPU_DEVICES" in os.environ
-    if cpu_devices or not by_environment:
-        jax.config.update("jax_num_cpu_devices", cpu_devices or _cores())
-
-
-def _cores() -> int:
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

@@ -9,7 +9,7 @@ import tyro
 from pydantic.fields import FieldInfo
 from tyro.constructors import ConstructorRegistry, StructConstructorSpec, StructFieldSpec, StructTypeInfo
 
-from rtcd_jax.config import EXAMPLE, UNIT, Config, Variable, load, parse, parse_yaml
+from rtcd_jax.config import EXAMPLE, SMALLEST_POPULATION, UNIT, Config, Variable, load, parse, parse_yaml
 from rtcd_jax.errors import UserError
 from rtcd_jax.settings import Settings, bounds
 from rtcd_jax.sweep import Case, read_cases
@@ -84,6 +84,29 @@ class SweepOptions:
 
 
 @dataclass(frozen=True)
+class ScaleOptions:
+    """Measure whole generations against the population and the devices; writes a table and figures.
+
+    Every point runs in a process of its own, on a CPU with a core for each device; what is measured already is kept.
+
+    Example: rtcd scale configs/pendulum_rtcd.yaml --populations 64,256,1024 --devices 1,2
+    """
+
+    config: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="CONFIG", help="the experiment, a YAML file")]
+    populations: Annotated[str, tyro.conf.arg(metavar="P,P,…", help="candidates in a generation [-]")] = "64,256,1024"
+    devices: Annotated[str, tyro.conf.arg(metavar="D,D,…", help="devices to share them out over [-]")] = "1,2"
+    repeats: Annotated[int, tyro.conf.arg(help="timed generations of each point [-] (>= 1)")] = 5
+    folder: Annotated[Path | None, tyro.conf.arg(help="of points, table and figures (checkpoints/scale_NAME)")] = None
+
+    def counts(self, name: str) -> tuple[int, ...]:
+        """The numbers of a list; `UserError` for one that is no number."""
+        try:
+            return tuple(int(word) for word in getattr(self, name).split(","))
+        except ValueError:
+            raise UserError(f"--{name} = {getattr(self, name)}: must be whole numbers, split by commas") from None
+
+
+@dataclass(frozen=True)
 class VerifyOptions:
     """Simulate fresh random states of a run's funnels with independent integrators; exit code 1 if too many fail.
 
@@ -132,7 +155,9 @@ class ReplayOptions:
 
     run: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RUN", help="the run folder")]
     file: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="FILE", help="the measured states, a CSV file")]
-    elite: Annotated[int, tyro.conf.arg(metavar="K", help="whose funnel; 0 is the best [-] (>= 0)")] = 0
+    elite: Annotated[
+        int | Literal["initial"], tyro.conf.arg(metavar="K", help="whose funnel; 0 is the best [-] (>= 0); or initial")
+    ] = 0
 
 
 @dataclass(frozen=True)
@@ -256,6 +281,17 @@ def read_sweep(arguments: Sequence[str], runs: Path) -> tuple[list[Case], SweepO
     return cases, options
 
 
+def read_scale(arguments: Sequence[str], runs: Path) -> tuple[Config, ScaleOptions]:
+    """The configuration and the options; `UserError` for a wrong YAML or number."""
+    options = tyro.cli(ScaleOptions, args=arguments, prog="rtcd scale", use_underscores=True)
+    if options.repeats < 1:
+        raise UserError(f"--repeats = {options.repeats}: must be >= 1")
+    for name, least in (("populations", SMALLEST_POPULATION), ("devices", 1)):
+        if min(options.counts(name)) < least:
+            raise UserError(f"--{name} = {getattr(options, name)}: all must be >= {least}")
+    return load(options.config), replace(options, folder=options.folder or runs / f"scale_{options.config.stem}")
+
+
 def read_verify(arguments: Sequence[str]) -> VerifyOptions:
     """The checked options of `rtcd verify`; `UserError` if one is out of range."""
     options = tyro.cli(VerifyOptions, args=arguments, prog="rtcd verify", use_underscores=True)
@@ -288,8 +324,8 @@ def read_animate(arguments: Sequence[str]) -> AnimateOptions:
 def read_replay(arguments: Sequence[str]) -> ReplayOptions:
     """The checked options of `rtcd replay`; `UserError` if one is out of range."""
     options = tyro.cli(ReplayOptions, args=arguments, prog="rtcd replay", use_underscores=True)
-    if options.elite < 0:
-        raise UserError(f"--elite = {options.elite}: must be >= 0")
+    if isinstance(options.elite, int) and options.elite < 0:
+        raise UserError(f"--elite = {options.elite}: must be >= 0, or initial")
     _require_run(options.run)
     return options
 

@@ -107,13 +107,13 @@ def _with(data: Mapping[str, Any], values: Mapping[str, Any], path: Path) -> dic
     for key, value in values.items():
         *parents, last = key.split(".")
         place: Any = changed
-        for parent in parents:
-            place = (
-                place[int(parent)] if isinstance(place, list) and parent.isdecimal() else place.setdefault(parent, {})
-            )
-            if not isinstance(place, dict | list):
-                raise ConfigError([Problem(("sweep", key), f"{parent} is no section", place)], str(path))
-        place[int(last) if isinstance(place, list) else last] = value
+        try:
+            for parent in parents:
+                place = place[int(parent)] if isinstance(place, list) else place.setdefault(parent, {})
+            place[int(last) if isinstance(place, list) else last] = value
+        except (AttributeError, IndexError, TypeError, ValueError):
+            text = "leads to no place in the file: names of sections and numbers of list entries, joined by dots"
+            raise ConfigError([Problem(("sweep", key), text)], str(path)) from None
     return changed
 
 

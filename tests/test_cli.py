@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 from rtcd_jax import cli
+from rtcd_jax.backend import cores
 from rtcd_jax.config import Config, load, resolved
 
 ROOT = Path(__file__).parent.parent
@@ -121,7 +122,10 @@ WRONG = {
     "negative seed to animate": (["animate", "configs", "--seed", "-1"], "--seed = -1: must be >= 0"),
     "no such run to replay": (["replay", "no/such/run", "x.csv"], "no/such/run: no such run folder"),
     "nothing to replay": (["replay", "configs"], "FILE"),
-    "negative elite to replay": (["replay", "configs", "x.csv", "--elite", "-1"], "--elite = -1: must be >= 0"),
+    "negative elite to replay": (
+        ["replay", "configs", "x.csv", "--elite", "-1"],
+        "--elite = -1: must be >= 0, or initial",
+    ),
     "misspelt verify option": (["verify", "configs", "--sed", "1"], "--seed"),
 }
 
@@ -162,7 +166,7 @@ def run_module(monkeypatch):
     module = types.ModuleType("rtcd_jax.run")
     module.optimize = lambda config, folder, console, cluster: calls.append((config, folder))
     monkeypatch.setitem(sys.modules, "rtcd_jax.run", module)
-    monkeypatch.setattr(cli, "_prepare_jax", lambda *_: None)
+    monkeypatch.setattr(cli, "prepare_jax", lambda *_: None)
     monkeypatch.setattr("rtcd_jax.cluster.Cluster.heed", lambda cluster: None)  # signals stay pytest's
     module.calls = calls
     return module
@@ -225,7 +229,7 @@ def test_verify_exits_by_the_promise(monkeypatch, tmp_path, held, code):
     module = types.ModuleType("rtcd_jax.verify")
     module.verify_run = lambda folder, states, seed, workers, console: calls.append((folder, states, seed)) or held
     monkeypatch.setitem(sys.modules, "rtcd_jax.verify", module)
-    monkeypatch.setattr(cli, "_prepare_jax", lambda *_: None)
+    monkeypatch.setattr(cli, "prepare_jax", lambda *_: None)
     assert cli.main(["verify", str(tmp_path), "--states", "10", "--seed", "3"]) == code
     assert calls == [(tmp_path, 10, 3)]
 
@@ -236,15 +240,16 @@ def test_replay_exits_by_the_funnel(monkeypatch, tmp_path, kept, code):
     module = types.ModuleType("rtcd_jax.report.replay")
     module.replay_run = lambda folder, file, elite, console: calls.append((folder, file, elite)) or kept
     monkeypatch.setitem(sys.modules, "rtcd_jax.report.replay", module)
-    assert cli.main(["replay", str(tmp_path), "lab.csv", "--elite", "2"]) == code
-    assert calls == [(tmp_path, Path("lab.csv"), 2)]
+    for elite in ("2", "initial"):
+        assert cli.main(["replay", str(tmp_path), "lab.csv", "--elite", elite]) == code
+    assert calls == [(tmp_path, Path("lab.csv"), 2), (tmp_path, Path("lab.csv"), "initial")]
 
 
 @pytest.mark.parametrize(
     ("verb", "arguments"), [("report", ["."]), ("animate", ["."]), ("replay", [".", "measured.csv"])]
 )
 def test_what_is_no_run_folder_is_told_in_one_line(verb, arguments, tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(cli, "_prepare_jax", lambda: None)
+    monkeypatch.setattr(cli, "prepare_jax", lambda: None)
     monkeypatch.chdir(tmp_path)
     assert cli.main([verb, *arguments]) == 2
     assert capsys.readouterr().err == "rtcd: . is no run folder: it has no format.json\n"
@@ -258,8 +263,8 @@ def test_help_has_an_example(verb):
 
 
 PREPARED = """
-from rtcd_jax.cli import _prepare_jax
-_prepare_jax()
+from rtcd_jax.backend import prepare_jax
+prepare_jax()
 import jax
 print(jax.device_count(), jax.numpy.zeros(1).dtype)
 """
@@ -272,7 +277,7 @@ def prepared(environment):
 
 
 def test_double_precision_on_every_core():
-    assert prepared({}) == f"{cli._cores()} float64"
+    assert prepared({}) == f"{cores()} float64"
 
 
 @pytest.mark.parametrize(

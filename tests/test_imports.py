@@ -11,7 +11,7 @@ PACKAGE = Path(__file__).parent.parent / "rtcd_jax"
 
 # From the bottom up; a module imports from its own layer and those below it. A folder stands for all its modules.
 LAYERS = (
-    {"errors", "numerics", "files", "provenance"},
+    {"errors", "numerics", "files", "provenance", "backend"},
     {"settings", "types", "console"},
     {"config", "sweep"},
     {"plants"},
@@ -26,7 +26,7 @@ LAYERS = (
     {"storage"},
     {"verify", "options", "reference", "certificate", "report"},
     {"export", "disturb"},
-    {"run"},
+    {"run", "scale"},
     {"cli"},
 )
 
@@ -38,10 +38,10 @@ OWNERS = {
     "flint": {"certificate"},
     "orbax": {"storage"},
     "evosax": {"cmaes"},
-    "rich": {"console", "sweep", "verify", "certificate", "report"},
+    "rich": {"console", "sweep", "scale", "verify", "certificate", "report"},
     "tyro": {"options"},
     "yaml": {"config", "export"},
-    "matplotlib": {"report"},
+    "matplotlib": {"report", "scale"},
     "PIL": {"report"},
     "imageio_ffmpeg": {"report"},
     "pydantic": {"settings", "config", "options", "reference"},

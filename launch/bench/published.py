@@ -11,7 +11,8 @@ from pathlib import Path
 
 import jax
 import jax.numpy as jnp
-from measure import prepare_jax
+
+from rtcd_jax.backend import prepare_jax
 
 CONFIGS = Path(__file__).parents[2] / "configs"
 CANDIDATES = {  # the design variables, then the diagonals of Q and R (paper, table I and the authors' results)
@@ -32,7 +33,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("robot", nargs="?", choices=CANDIDATES, default="pendulum")
     robot = parser.parse_args().robot
-    prepare_jax()
+    prepare_jax(1)
     from rtcd_jax.config import load
     from rtcd_jax.evaluation import elite_effort, make_evaluate
     from rtcd_jax.population import encode

@@ -79,8 +79,8 @@ def on_grid(matrix: np.ndarray) -> list[list]:
 class Descent:
     """The search for one elite's funnel. `exact` asks the checker after every interval (rung *proved*)."""
 
-    def __init__(self, claim: Claim, loop: Loop, exact: bool, evenness: float | None = None):
-        self.claim, self.loop, self.exact, self.evenness = claim, loop, exact, evenness
+    def __init__(self, claim: Claim, loop: Loop, exact: bool, aim: flow.Aim | None = None):
+        self.claim, self.loop, self.exact, self.aim = claim, loop, exact, aim
         self._directions = directions(claim.n)
 
     def outlet(self, rho: float) -> Front:
@@ -90,9 +90,9 @@ class Descent:
 
     def down_from(self, front: Front) -> Iterator[Proved]:
         """The intervals from the front back to t = 0, or to where nothing can be proved."""
-        waiting = [(k, 0.0, 1.0) for k in range(front.knot)]
-        if front.share > 0:
-            waiting.append((front.knot, 0.0, front.share))
+        parts = [(0.0, 1.0)] if self.aim is None else flow.shares(self.loop)
+        waiting = [(k, *part) for k in range(front.knot) for part in parts]
+        waiting += [(front.knot, start, min(end, front.share)) for start, end in parts if start < front.share]
         while waiting:
             k, start, end = waiting.pop()
             short = end - start <= SHORTEST
@@ -124,7 +124,7 @@ class Descent:
 
     def _attempt(self, k: int, start: float, end: float, front: Front, spare: float) -> Proved | None:
         try:
-            shape = self._piece if self.evenness is None else self._fastest_piece
+            shape = self._piece if self.aim is None else self._fastest_piece
             piece, rho = shape(k, start, end, front, spare)
             check.insist_bounds(self.claim, check.motion(self.claim, piece), "limits")
             piece, todo, degree = self._models(piece, spare)
@@ -162,7 +162,7 @@ class Descent:
         loop, duration = self.loop, (end - start) * self.loop.dt
         b = np.array([[float(c) for c in row] for row in front.axes])
         aims = self._directions[:, ::AIMS_SHARED]
-        w = flow.fastest_growth(loop, k, start, end, b, spare, cast(float, self.evenness), aims)
+        w = flow.fastest_growth(loop, k, start, end, b, spare, cast(flow.Aim, self.aim), aims)
         if w is None:
             raise Refused("interval", "no ellipsoid can be carried back")
         a = b @ expm(-w * duration)

@@ -19,7 +19,7 @@ from rtcd_jax.console import Console
 CHUNK = 16384
 """Motions simulated together: their states stay in the processor's cache."""
 PILOT = 512
-FEWEST, MOST = 2, 128
+FEWEST, MOST = 4, 128
 """Steps an interval, doubled until the integrator's error is small."""
 TOLERANCE = 1e-5
 """In |y|, of the pilot's motions."""

@@ -4,13 +4,18 @@ With L' = L W, W symmetric and constant on an interval, |y| falls on the boundar
 
     y'W y > y'L^-1 (f(x* + L y, u) - x*') =: g(t, y)   for all |y| = 1,
 
-and the volume grows backward at the rate -tr W. So W solves a linear program: minimize tr W + evenness max y'W y such
-that the inequality holds at sampled t and y with a spare rate, and the limits on the states are kept; g is taken along
-the ellipsoids of the previous W, a fixed point in a few rounds. The TVLQR's shape is one feasible choice at every
+and the volume grows backward at the rate -tr W. So W solves a linear program: minimize tr(M W) + evenness max y'W y
+such that the inequality holds at sampled t and y with a spare rate, and the limits on the states are kept; g is taken
+along the ellipsoids of the previous W, a fixed point in a few rounds. The TVLQR's shape is one feasible choice at every
 instant; here the shape is free (Tobenkin, Manchester, Tedrake 2011, alternate between multipliers and V to that end).
+
+What is largest at once may end thin: M = G^-attraction, G = L'S L, looks ahead by the value function. Without it
+the volume grows fastest, with much of it the largest level set of TVLQR inside the ellipsoid, and between
+them a power mean of the half axes measured by S.
 """
 
-import itertools
+import math
+from typing import NamedTuple
 
 import numpy as np
 from scipy.linalg import expm
@@ -18,8 +23,16 @@ from scipy.optimize import linprog
 
 from rtcd_jax.certificate.loop import Loop
 
-EVENNESS = (0.1, 0.3, 1.0)
-"""Weights of the fastest shrinking direction beside the volume, to choose from: none is best for all elites."""
+
+class Aim(NamedTuple):
+    """What an ellipsoid of free shape aims at beside its volume."""
+
+    evenness: float
+    attraction: float
+
+
+AIMS = (Aim(0.1, 0.0), Aim(0.3, 0.0), Aim(1.0, 0.0), Aim(0.0, 1.0), Aim(0.0, 2.0))
+"""To choose from: none is best for all elites."""
 ROUNDS = 6
 TIMES = 5
 """Instants of an interval at which the inequality is asked for."""
@@ -31,7 +44,7 @@ SHARE_OF_LIMIT = 0.99
 WIDEST = 2.0
 """Largest half width [rad] along the angle: beyond it polynomials follow the sine badly."""
 LONGEST = 0.05
-"""Longest interval [s] of predictions: one W for a longer one is too coarse."""
+"""Longest interval [s]: one W for a longer one gives volume away."""
 PREDICTED_SPARE = 0.02
 """Spare rate [1/s] of predictions."""
 KEPT_INLET = 0.5
@@ -39,11 +52,12 @@ KEPT_INLET = 0.5
 
 
 def fastest_growth(
-    loop: Loop, k: int, start: float, end: float, axes: np.ndarray, spare: float, evenness: float, y: np.ndarray
+    loop: Loop, k: int, start: float, end: float, axes: np.ndarray, spare: float, aim: Aim, y: np.ndarray
 ) -> np.ndarray | None:
     """W [n n] for the interval that ends with the ellipsoid `axes`; None if there is none."""
     pairs = [(i, j) for i in range(loop.n) for j in range(i + 1)]
-    cost = np.array([*(float(i == j) for i, j in pairs), evenness])
+    weight = _importance(axes.T @ loop.value(k, end)[0] @ axes, aim.attraction)
+    cost = np.array([*(weight[i, j] * (1 if i == j else 2) for i, j in pairs), aim.evenness])
     products = _products(y, pairs)
     below = np.column_stack([-products, np.ones(len(products))])  # the last unknown is max y'W y
     w = path = np.zeros((loop.n, loop.n))
@@ -68,6 +82,13 @@ def fastest_growth(
     return w
 
 
+def _importance(g: np.ndarray, attraction: float) -> np.ndarray:
+    """G^-attraction, its trace n."""
+    values, vectors = np.linalg.eigh(g)
+    weights = values**-attraction
+    return (vectors * (len(g) * weights / weights.sum())) @ vectors.T
+
+
 def _products(y: np.ndarray, pairs: list[tuple[int, int]]) -> np.ndarray:
     """Coefficients [D, pairs] of y'W y in the entries of W."""
     return np.stack([y[i] * y[j] * (1 if i == j else 2) for i, j in pairs], axis=1)
@@ -82,13 +103,12 @@ def _limits(loop: Loop, k: int, share: float, axes: np.ndarray, pairs: list) -> 
     return _products((axes[bounded] / widths[:, None]).T, pairs), -np.log(rooms[bounded] / widths) / SETTLING
 
 
-def predicted(loop: Loop, axes: np.ndarray, evenness: float, y: np.ndarray) -> np.ndarray | None:
+def predicted(loop: Loop, axes: np.ndarray, aim: Aim, y: np.ndarray) -> np.ndarray | None:
     """Volumes [N+1], knots first, up to the unit ball's, if every interval goes through; None if it cannot."""
     volumes = [np.linalg.det(axes)]
-    shares = np.linspace(1, 0, int(np.ceil(loop.dt / LONGEST)) + 1)
     for k in range(len(loop.u) - 1, -1, -1):
-        for end, start in itertools.pairwise(shares):
-            w = fastest_growth(loop, k, start, end, axes, PREDICTED_SPARE, evenness, y)
+        for start, end in reversed(shares(loop)):
+            w = fastest_growth(loop, k, start, end, axes, PREDICTED_SPARE, aim, y)
             if w is None:
                 return None
             axes = axes @ expm(-w * (end - start) * loop.dt)
@@ -96,12 +116,18 @@ def predicted(loop: Loop, axes: np.ndarray, evenness: float, y: np.ndarray) -> n
     return np.array(volumes[::-1])
 
 
-def best_evenness(loop: Loop, axes: np.ndarray, rhos: np.ndarray, y: np.ndarray) -> float | None:
-    """The evenness with the largest sum of volumes that about keeps the inlet of the levels `rhos`; None: keep S."""
+def shares(loop: Loop) -> list[tuple[float, float]]:
+    """The parts of a knots' interval that get a W each."""
+    parts = 2 ** max(math.ceil(math.log2(loop.dt / LONGEST)), 0)
+    return [(i / parts, (i + 1) / parts) for i in range(parts)]
+
+
+def best_aim(loop: Loop, axes: np.ndarray, rhos: np.ndarray, y: np.ndarray) -> Aim | None:
+    """The aim with the largest sum of volumes that about keeps the inlet of the levels `rhos`; None: keep S."""
     usual = rhos ** (loop.n / 2) / np.sqrt(np.linalg.det(loop.values))
     best, most = None, float(usual.sum())
-    for evenness in EVENNESS:
-        volumes = predicted(loop, axes, evenness, y)
+    for aim in AIMS:
+        volumes = predicted(loop, axes, aim, y)
         if volumes is not None and volumes.sum() > most and volumes[0] >= KEPT_INLET * usual[0]:
-            best, most = evenness, float(volumes.sum())
+            best, most = aim, float(volumes.sum())
     return best

@@ -24,6 +24,8 @@ ARRIVED = 0.1
 """|y| in the goal region at which a motion is followed no further: the proof holds all the way down."""
 LONGEST = 60.0
 """Time [s] after which a motion has not arrived."""
+COARSER = 4
+"""Steps in the goal region are so many times longer: there |y| falls fast, and its growth alone is judged."""
 TOGETHER = 0.2
 """Time [s] between two looks for motions that have arrived."""
 
@@ -129,7 +131,7 @@ class Motions:
 
     def _settle(self, flight: "_Flight", steps: int) -> tuple[np.ndarray, np.ndarray]:
         """Whether every motion arrives, and the largest growth of |y| in one step."""
-        count, step = flight.x.shape[1], self.dt / steps
+        count, step = flight.x.shape[1], COARSER * self.dt / steps
         arrived, growth = np.zeros(count, bool), np.zeros(count)
         moving = np.arange(count)
         for _ in range(round(LONGEST / TOGETHER)):
@@ -168,7 +170,7 @@ class Motions:
 
     def _slope(self, law: Input, t: float, x: np.ndarray) -> np.ndarray:
         u = np.clip(law(t, x), -self.limit, self.limit)
-        return self._rate(x.T, u[:, None]).T
+        return np.ascontiguousarray(self._rate(x.T, u[:, None]).T)
 
     def _steps(self, law: Input, t: float, step: float, x: np.ndarray, parts: int) -> np.ndarray:
         """The states after one step, taken in `parts` classical Runge-Kutta steps."""

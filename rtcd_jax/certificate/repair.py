@@ -28,6 +28,8 @@ MENDED = 1e-11
 ROUNDS = 100
 INSIDE = 0.999
 """Share of the limits that a mended motion may use."""
+SMALLEST = 1e-3
+"""Smallest scale of a state, for one that hardly moves."""
 
 
 class Flow(NamedTuple):
@@ -87,43 +89,48 @@ def _levels(outside: Outside, values: np.ndarray) -> np.ndarray:
 def _nearest(
     outside: Outside, x: np.ndarray, u: np.ndarray, now: Flow, limits: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """One quadratic program: the states' knots inside and all inputs."""
+    """One quadratic program for all knots and inputs, Phi linearized about x [N+1 n] and u [N]."""
     import clarabel
 
-    intervals, n = len(u), x.shape[1]
-    states, size = (intervals - 1) * n, (intervals - 1) * n + intervals
-    scale = np.maximum(np.max(np.abs(outside.x), axis=0), 1e-3)
-    weights = np.concatenate([np.tile(scale**-2, intervals - 1), np.full(intervals, outside.limit**-2)])
-    given = np.concatenate([outside.x[1:-1].ravel(), outside.u])
-    blocks: list[list[Any]] = [[None] * (2 * intervals - 1) for _ in range(intervals)]
-    offset = np.empty((intervals, n))
-    for k in range(intervals):
-        a, b = now.by_state[k], now.by_input[k]
-        offset[k] = now.end[k] - a @ x[k] - b * u[k]
-        if k > 0:
-            blocks[k][k - 1] = sp.csc_matrix(-a)
-        else:
-            offset[k] += a @ x[0]
-        if k < intervals - 1:
-            blocks[k][k] = sp.identity(n)
-        else:
-            offset[k] -= x[-1]
-        blocks[k][intervals - 1 + k] = sp.csc_matrix(-b[:, None])
-    bounds = np.concatenate([np.tile(INSIDE * limits, intervals - 1), np.full(intervals, INSIDE * outside.limit)])
-    bounded = sp.identity(size, format="csr")[np.isfinite(bounds)]
-    table = sp.vstack([sp.bmat(blocks), bounded, -bounded], format="csc")
+    rows, offset = _linearized(x, u, now)
+    knots, n = x.shape
+    scale = np.maximum(np.max(np.abs(outside.x), axis=0), SMALLEST)
+    weights = np.concatenate([np.tile(scale**-2, knots), np.full(len(u), outside.limit**-2)])
+    given = np.concatenate([outside.x.ravel(), outside.u])
+    room = np.full_like(x, np.inf)
+    room[1:-1] = INSIDE * limits
+    bounds = np.concatenate([room.ravel(), np.full(len(u), INSIDE * outside.limit)])
+    bounded = sp.identity(len(bounds), format="csr")[np.isfinite(bounds)]
     finite = bounds[np.isfinite(bounds)]
     settings = clarabel.DefaultSettings()
     settings.verbose = False
-    cones = [clarabel.ZeroConeT(intervals * n), clarabel.NonnegativeConeT(2 * len(finite))]
-    right = np.concatenate([offset.ravel(), finite, finite])
     solution = clarabel.DefaultSolver(
-        sp.diags(weights, format="csc"), -weights * given, table, right, cones, settings
+        sp.diags(weights, format="csc"),
+        -weights * given,
+        sp.vstack([rows, bounded, -bounded], format="csc"),
+        np.concatenate([offset, finite, finite]),
+        [clarabel.ZeroConeT(len(offset)), clarabel.NonnegativeConeT(2 * len(finite))],
+        settings,
     ).solve()
     if str(solution.status) not in ("Solved", "AlmostSolved"):
-        raise UserError(f"the mended motion's program ended with {solution.status}")
+        raise UserError(
+            f"no motion between the given ends and within the limits solves the dynamics: {solution.status}"
+        )
     z = np.asarray(solution.x)
-    return np.concatenate([x[:1], z[:states].reshape(-1, n), x[-1:]]), z[states:]
+    return np.concatenate([x[:1], z[n : x.size - n].reshape(-1, n), x[-1:]]), z[x.size :]
+
+
+def _linearized(x: np.ndarray, u: np.ndarray, now: Flow) -> tuple[Any, np.ndarray]:
+    """Sparse rows and right sides of x_{k+1} - A_k x_k - B_k u_k = Phi_k - A_k x_k^0 - B_k u_k^0, and of the pinned ends."""
+    knots, n = x.shape
+    ends = sp.identity(x.size, format="csr")[[*range(n), *range(x.size - n, x.size)]]
+    states = sp.kron(sp.eye(knots - 1, knots, k=1), sp.identity(n)) - sp.block_diag(now.by_state) @ sp.kron(
+        sp.eye(knots - 1, knots), sp.identity(n)
+    )
+    inputs = sp.block_diag([-b[:, None] for b in now.by_input])
+    rows = sp.bmat([[states, inputs], [ends, None]], format="csc")
+    right = now.end - np.einsum("kij,kj->ki", now.by_state, x[:-1]) - now.by_input * u[:, None]
+    return rows, np.concatenate([right.ravel(), x[0], x[-1]])
 
 
 def tracking_values(outside: Outside, cost: Cost) -> np.ndarray:

@@ -175,6 +175,16 @@ def test_ranks_of_sampled_and_proved_sums():
     assert rank_correlation(turned) == pytest.approx(-1)
 
 
+def test_attraction_weighs_the_narrow_directions():
+    """G^-a with trace n: none at 0; the more, the more the largest level set of V inside the ellipsoid counts."""
+    g = np.array([[4.0, 1.0], [1.0, 0.5]])
+    np.testing.assert_allclose(flow._importance(g, 0.0), np.eye(2), atol=1e-12)
+    inverse = np.linalg.inv(g)
+    np.testing.assert_allclose(flow._importance(g, 1.0), 2 * inverse / np.trace(inverse), rtol=1e-12)
+    least = np.linalg.eigh(g)[1][:, 0]
+    np.testing.assert_allclose(flow._importance(g, 40.0), 2 * np.outer(least, least), atol=1e-9)
+
+
 @pytest.mark.slow
 def test_ellipsoids_of_free_shape_are_larger(tmp_path):
     """Where S is not TVLQR's but a poor one, freeing the shape gives more than the proof with that S."""
@@ -198,7 +208,7 @@ def test_free_shapes_obey_the_sampled_inequality():
     claim = claimed(arrays, record)
     loop, aims = Loop(claim, arrays), descent.directions(2)[:, ::4]
     axes, _ = loop.axes(2, 1.0, 3.0, 0.0)
-    w = flow.fastest_growth(loop, 2, 0.0, 1.0, axes, 0.1, 0.0, aims)
+    w = flow.fastest_growth(loop, 2, 0.0, 1.0, axes, 0.1, flow.Aim(0.0, 0.0), aims)
     for share in (0.0, 0.5, 1.0):
         here = axes @ expm(-w * (1 - share) * loop.dt)
         growth = np.sum(aims * (w @ aims), axis=0) - loop.drift(2, share, here, aims)
