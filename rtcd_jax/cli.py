@@ -183,7 +183,7 @@ def export(arguments: Sequence[str]) -> int:
     from rtcd_jax.options import read_export
 
     options = read_export(arguments)
-    _prepare_jax()
+    prepare_jax()
     from rtcd_jax.console import Console
     from rtcd_jax.export import export_run
 
@@ -197,7 +197,7 @@ def disturb(arguments: Sequence[str]) -> int:
     from rtcd_jax.options import read_disturb
 
     options = read_disturb(arguments)
-    _prepare_jax()
+    prepare_jax()
     from rtcd_jax.console import Console
     from rtcd_jax.disturb import disturb_run
 

@@ -13,6 +13,8 @@ x_goal)). The funnel is {x : V = (x - x*)'S(t)(x - x*) <= rho(t)}, S the cubic H
 log rho linear.
 """
 
+from __future__ import annotations  # robots run old Pythons
+
 import math
 import sys
 from pathlib import Path
