@@ -255,7 +255,7 @@ def test_what_is_no_run_folder_is_told_in_one_line(verb, arguments, tmp_path, ca
     assert capsys.readouterr().err == "rtcd: . is no run folder: it has no format.json\n"
 
 
-@pytest.mark.parametrize("verb", ["report", "animate", "replay"])
+@pytest.mark.parametrize("verb", ["report", "animate", "replay", "disturb", "export"])
 def test_help_has_an_example(verb):
     code, output, _ = rtcd(verb, "--help")
     assert code == 0
