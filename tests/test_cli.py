@@ -255,11 +255,36 @@ def test_what_is_no_run_folder_is_told_in_one_line(verb, arguments, tmp_path, ca
     assert capsys.readouterr().err == "rtcd: . is no run folder: it has no format.json\n"
 
 
-@pytest.mark.parametrize("verb", ["report", "animate", "replay"])
+@pytest.mark.parametrize("verb", ["report", "animate", "replay", "disturb", "export"])
 def test_help_has_an_example(verb):
     code, output, _ = rtcd(verb, "--help")
     assert code == 0
     assert f"Example: rtcd {verb} checkpoints/" in flat(output)
+
+
+def _standing_in(monkeypatch, name, verb):
+    """The module in the place of the one that the verb imports, and the calls that it gets."""
+    calls = []
+    module = types.ModuleType(f"rtcd_jax.{name}")
+    setattr(module, verb, lambda *arguments: calls.append(arguments[:-1]))
+    monkeypatch.setitem(sys.modules, f"rtcd_jax.{name}", module)
+    monkeypatch.setattr(cli, "prepare_jax", lambda: None)
+    return calls
+
+
+def test_export_hands_on_the_elite_and_the_folder(monkeypatch, tmp_path):
+    calls = _standing_in(monkeypatch, "export", "export_run")
+    assert cli.main(["export", str(tmp_path), "--to", "lab"]) == 0
+    assert cli.main(["export", str(tmp_path), "--to", "lab", "--elite", "3"]) == 0
+    assert cli.main(["export", str(tmp_path), "--to", "lab", "--elite", "initial"]) == 0
+    assert calls == [(tmp_path, elite, Path("lab")) for elite in (0, 3, "initial")]
+
+
+def test_disturb_hands_on_states_and_seed(monkeypatch, tmp_path):
+    calls = _standing_in(monkeypatch, "disturb", "disturb_run")
+    assert cli.main(["disturb", str(tmp_path)]) == 0
+    assert cli.main(["disturb", str(tmp_path), "--states", "10", "--seed", "3"]) == 0
+    assert calls == [(tmp_path, 1000, 0), (tmp_path, 10, 3)]
 
 
 PREPARED = """

@@ -105,7 +105,7 @@ def test_the_monitor_says_inside_and_abort_on_both_sides_of_the_boundary(export,
     for radius, inside, abort in ((0.0, True, False), (0.999, True, False), (1.001, False, False), (2.01, False, True)):
         watch = monitor(t, now.x + radius * direction)
         assert (bool(watch.inside), bool(watch.abort)) == (inside, abort)
-        np.testing.assert_allclose(watch.margin, 1 - radius, atol=1e-9)
+        np.testing.assert_allclose(watch.margin, 1 - radius**2, atol=1e-9)
 
 
 def test_beyond_a_limit_of_the_states_the_monitor_advises_to_abort(export, loop):
@@ -200,6 +200,21 @@ def test_the_dfki_interface_speaks_of_joints(export):
         floats = controller.get_control_output(x[0], x[1], 0.0, t)
         assert all(type(value) is float for value in floats)
         assert floats == (pos[0], vel[0], tau[0])
+
+
+def test_what_is_returned_may_be_changed(export):
+    """Nothing that a robot's program does to the outputs reaches the controller."""
+    controller = export.module.Controller()
+    for t in (0.0, 2 * controller.duration):
+        before = controller.get_control_output(*np.split(export.bundle.elite.x[0], 2), None, t)
+        kept = [np.array(part) for part in before]
+        for part in (*before, controller.control(np.nan, export.bundle.elite.x[0])):
+            part += 1.0
+        for part, old in zip(
+            controller.get_control_output(*np.split(export.bundle.elite.x[0], 2), None, t), kept, strict=True
+        ):
+            np.testing.assert_array_equal(part, old)
+    np.testing.assert_array_equal(controller.control(np.nan, export.bundle.elite.x[0]), 0)
 
 
 def test_both_self_tests_pass_and_can_fail(export, tmp_path):

@@ -100,7 +100,7 @@ rtcd_monitor rtcd_watch(double t, const double x[RTCD_STATES], double abort_rati
             value += (x[i] - nominal[i]) * value_at(k, s, i, j) * (x[j] - nominal[j]);
     }
     now.ratio = fmax(value, 0.0) * exp(-((1.0 - s) * RTCD_LOG_RHO[k] + s * RTCD_LOG_RHO[next]));
-    now.margin = 1.0 - sqrt(now.ratio);
+    now.margin = 1.0 - now.ratio;
     now.inside = now.ratio <= 1.0 && !outside;
     now.abort_advised = now.ratio > abort_ratio || outside;
     return now;

@@ -13,7 +13,7 @@ extern "C" {
 #endif
 
 /* Where a state is in the funnel now. ratio is V/rho: 0 on the nominal motion, 1 on the funnel's boundary.
- * margin = 1 - sqrt(ratio), negative outside. abort_advised: ratio above the given one, or beyond the states' limits. */
+ * margin = 1 - ratio, negative outside. abort_advised: ratio above the given one, or beyond the states' limits. */
 typedef struct {
     double ratio;
     double margin;

@@ -13,6 +13,8 @@ x_goal)). The funnel is {x : V = (x - x*)'S(t)(x - x*) <= rho(t)}, S the cubic H
 log rho linear.
 """
 
+from __future__ import annotations  # robots run old Pythons
+
 import math
 import sys
 from pathlib import Path
@@ -27,8 +29,8 @@ TOLERANCE = 1e-6
 class Monitor(NamedTuple):
     """Where a state is in the funnel now.
 
-    `ratio` is V/rho: 0 on the nominal motion, 1 on the funnel's boundary. `margin` = 1 - sqrt(ratio) is the share of
-    the way from the nominal motion to the boundary that is left, negative outside. `abort` advises to stop.
+    `ratio` is V/rho: 0 on the nominal motion, 1 on the funnel's boundary. `margin` = 1 - ratio is negative outside.
+    `abort` advises to stop.
     """
 
     ratio: float
@@ -52,7 +54,6 @@ class Controller:
             self.u_max, self.limits, self.joints = stored["u_max"], stored["state_limits"], stored["input_joints"]
         self.abort_ratio = abort_ratio
         self.dt, self.duration = float(time[1]), float(time[-1])
-        self._rest = np.zeros_like(self.u_max)
         self._log_levels, self._last_value = np.log(levels).tolist(), values[-1] / levels[-1]
         # Coefficients of 1, s, s^2, s^3, one row an interval: of x*(t) with K(t) behind it, and of S(t).
         flat = gains.reshape(len(gains), -1)
@@ -108,7 +109,7 @@ class Controller:
             ratio = float(error @ value @ error) * math.exp(-log_level)
         outside = bool((np.abs(x) > self.limits).any())
         ratio = max(ratio, 0.0)  # the rounding of a state on the nominal motion
-        return Monitor(ratio, 1 - math.sqrt(ratio), ratio <= 1 and not outside, ratio > self.abort_ratio or outside)
+        return Monitor(ratio, 1 - ratio, ratio <= 1 and not outside, ratio > self.abort_ratio or outside)
 
     def _place(self, t: float):
         """The interval and the fraction of it; None behind the last one."""
@@ -121,13 +122,13 @@ class Controller:
         """x*(t) and u."""
         k, s = self._place(t) if np.isfinite(t) else (None, 0.0)
         if k is None:
-            nominal, u = self.x_goal, -(self.goal_gain @ (x - self.x_goal))
+            nominal, u = self.x_goal.copy(), -(self.goal_gain @ (x - self.x_goal))
         else:
             row = np.array([1.0, s, s * s, s * s * s]) @ self._table[k]
             nominal = row[: len(x)]
             u = self.u[k] - row[len(x) :].reshape(-1, len(x)) @ (x - nominal)
         if not (np.isfinite(x).all() and np.isfinite(t)):
-            return nominal, self._rest
+            return nominal, np.zeros_like(self.u_max)
         return nominal, np.minimum(np.maximum(u, -self.u_max), self.u_max)
 
 
