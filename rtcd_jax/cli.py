@@ -75,6 +75,7 @@ def _on_cluster(machines: Any, folder: Path, run: Callable[[Any, Any], None]) ->
     cluster.heed()
     with Console() if cluster.first else silent() as console:
         try:
+            cluster.meet()
             run(console, cluster)
         except Preempted:
             console.message(f"asked to stop (SIGTERM): saved in {folder}; the same command goes on")
