@@ -9,19 +9,13 @@ import os
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import NoReturn
+from typing import Any, NoReturn
 
+from rtcd_jax.backend import cores, prepare_jax
 from rtcd_jax.errors import UserError, closest
 
 OK, BROKEN_PROMISE, WRONG_INPUT, LOST_PROCESS, PREEMPTED, INTERRUPTED = 0, 1, 2, 75, 85, 130
 RUNS = Path("checkpoints")
-
-CPU_FLAGS = (
-    "--xla_cpu_prefer_vector_width=512",  # twice as fast with AVX-512
-    # Loops over knots are compiled whole: elsewhere every operation in them is a call of its own.
-    "--xla_backend_extra_options=xla_cpu_small_while_loop_byte_threshold=100000000",
-)
-"""XLA's options for the CPU."""
 
 
 def optimize(arguments: Sequence[str]) -> int:
@@ -29,20 +23,61 @@ def optimize(arguments: Sequence[str]) -> int:
     from rtcd_jax.options import read_optimize
 
     config, options = read_optimize(arguments, RUNS)
-    _prepare_jax(options.cpu_devices)
+
+    def run(console, cluster) -> None:
+        from rtcd_jax.run import optimize as run_optimize
+
+        run_optimize(config, options.run, console, cluster)
+
+    return _on_cluster(options.machines, options.run, run)
+
+
+def sweep(arguments: Sequence[str]) -> int:
+    """make all the runs that a YAML's sweep section asks for, or one of them"""
+    from rtcd_jax.options import read_sweep
+    from rtcd_jax.sweep import show
+
+    cases, options = read_sweep(arguments, RUNS)
+    if options.list:
+        print(show(cases, options.folder))
+        return OK
+
+    def run(console, cluster) -> None:
+        from rtcd_jax.run import optimize as run_optimize
+
+        failed = []
+        for case in cases if options.case is None else [cases[options.case]]:
+            console.message(f"case {case.number} of 0 … {len(cases) - 1}: {case.folder}")
+            try:
+                run_optimize(case.config, case.folder, console, cluster)
+            except UserError as error:  # the others may do better
+                console.message(f"case {case.number} ended early: {error}")
+                failed.append(case.folder.name)
+        cluster.on_first(lambda: console.message(show(cases, options.folder)))
+        if failed:
+            raise UserError(f"{len(failed)} of the cases ended early, see above: {', '.join(failed)}")
+
+    return _on_cluster(options.machines, options.folder, run)
+
+
+def _on_cluster(machines: Any, folder: Path, run: Callable[[Any, Any], None]) -> int:
+    """Joins the other processes of `machines`, if any, and runs `run(console, cluster)`; the exit code.
+
+    What ends early leaves the process at once.
+    """
+    prepare_jax(machines.cpu_devices)
     from rtcd_jax.cluster import Cluster, Lost, Preempted, join, part
 
-    join(options.coordinator, options.num_processes, options.process_id)  # before any import that touches a device
+    join(machines.coordinator, machines.num_processes, machines.process_id)  # before anything touches a device
     from rtcd_jax.console import Console, silent
-    from rtcd_jax.run import optimize as run_optimize
 
-    cluster = Cluster.of(options.devices)
+    cluster = Cluster.of(machines.devices)
     cluster.heed()
     with Console() if cluster.first else silent() as console:
         try:
-            run_optimize(config, options.run, console, cluster)
+            run(console, cluster)
         except Preempted:
-            console.message(f"asked to stop (SIGTERM): saved in {options.run}; the same command goes on")
+            console.message(f"asked to stop (SIGTERM): saved in {folder}; the same command goes on")
             part()
             _leave(PREEMPTED)
         except Lost as error:
@@ -63,17 +98,31 @@ def _leave(code: int) -> NoReturn:
     os._exit(code)
 
 
+def scale(arguments: Sequence[str]) -> int:
+    """measure what a generation costs against population and devices"""
+    from rtcd_jax.options import read_scale
+
+    config, options = read_scale(arguments, RUNS)
+    from rtcd_jax.console import Console
+    from rtcd_jax.scale.study import study
+
+    grid = options.counts("populations"), options.counts("devices")
+    with Console() as console:
+        study(options.config, config, *grid, options.repeats, options.folder, console)
+    return OK
+
+
 def verify(arguments: Sequence[str]) -> int:
     """simulate fresh random states of a run's funnels with independent integrators"""
     from rtcd_jax.options import read_verify
 
     options = read_verify(arguments)
-    _prepare_jax()
+    prepare_jax()
     from rtcd_jax.console import Console
     from rtcd_jax.verify import verify_run
 
     with Console() as console:
-        held = verify_run(options.run, options.states, options.seed, options.workers or _cores(), console)
+        held = verify_run(options.run, options.states, options.seed, options.workers or cores(), console)
     return OK if held else BROKEN_PROMISE
 
 
@@ -94,7 +143,7 @@ def animate(arguments: Sequence[str]) -> int:
     from rtcd_jax.options import read_animate
 
     options = read_animate(arguments)
-    _prepare_jax()
+    prepare_jax()
     from rtcd_jax.console import Console
     from rtcd_jax.report.animate import animate_run
 
@@ -127,6 +176,34 @@ def certify(arguments: Sequence[str]) -> int:
     with Console() as console:
         whole = certify_run(options.run, options.elites, options.rung, options.workers, console, options.optimize_value)
     return OK if whole else BROKEN_PROMISE
+
+
+def export(arguments: Sequence[str]) -> int:
+    """write the controller, its funnel monitor and the design of an elite for a lab"""
+    from rtcd_jax.options import read_export
+
+    options = read_export(arguments)
+    prepare_jax()
+    from rtcd_jax.console import Console
+    from rtcd_jax.export import export_run
+
+    with Console() as console:
+        export_run(options.run, options.elite, options.to, console)
+    return OK
+
+
+def disturb(arguments: Sequence[str]) -> int:
+    """try a run's best elite and its initial candidate: off-nominal starts, pushes, wrong models, noise, delay"""
+    from rtcd_jax.options import read_disturb
+
+    options = read_disturb(arguments)
+    prepare_jax()
+    from rtcd_jax.console import Console
+    from rtcd_jax.disturb import disturb_run
+
+    with Console() as console:
+        disturb_run(options.run, options.states, options.seed, console)
+    return OK
 
 
 def check(arguments: Sequence[str]) -> int:
@@ -167,11 +244,15 @@ def audit(arguments: Sequence[str]) -> int:
 
 VERBS: dict[str, Callable[[Sequence[str]], int]] = {
     "optimize": optimize,
+    "sweep": sweep,
+    "scale": scale,
     "verify": verify,
     "report": report,
     "animate": animate,
     "replay": replay,
     "certify": certify,
+    "disturb": disturb,
+    "export": export,
     "check": check,
     "falsify": falsify,
     "audit": audit,
@@ -218,20 +299,3 @@ def _version() -> str:
     from importlib.metadata import version
 
     return f"rtcd {version('rtcd-jax')}"
-
-
-def _prepare_jax(cpu_devices: int | None = None) -> None:
-    """Double precision; XLA's options for the CPU; that many CPU devices, or one for each core this process may use."""
-    flags = os.environ.get("XLA_FLAGS", "")
-    ours = (flag for flag in CPU_FLAGS if flag.split("=")[0] not in flags)
-    os.environ["XLA_FLAGS"] = " ".join([flags, *ours]).strip()
-    import jax
-
-    jax.config.update("jax_enable_x64", True)
-    by_environment = "host_platform_device_count" in flags or "JAX_NUM_CPU_DEVICES" in os.environ
-    if cpu_devices or not by_environment:
-        jax.config.update("jax_num_cpu_devices", cpu_devices or _cores())
-
-
-def _cores() -> int:
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

@@ -448,24 +448,36 @@ _Loader.add_implicit_resolver("tag:yaml.org,2002:float", _EXPONENT_WITHOUT_DOT, 
 
 def parse_yaml(text: str | bytes, source: str = "configuration") -> Config:
     """The configuration that a YAML text describes; `ConfigError` if it is no YAML or no valid configuration."""
+    return parse(_plain_yaml(text, source), source)
+
+
+def _plain_yaml(text: str | bytes, source: str) -> Any:
     try:
-        data = yaml.load(text, _Loader)
+        return yaml.load(text, _Loader)
     except yaml.MarkedYAMLError as error:
         mark = error.problem_mark
         place = f"line {mark.line + 1}, column {mark.column + 1}: " if mark else ""
         raise ConfigError([Problem((), f"no valid YAML: {place}{error.problem}")], source) from None
     except yaml.YAMLError as error:
         raise ConfigError([Problem((), f"no valid YAML: {error}")], source) from None
-    return parse(data, source)
 
 
 def load(path: Path) -> Config:
     """The configuration in a YAML file; `ConfigError` names everything that is wrong with it."""
+    data = read_yaml(path)
+    if isinstance(data, Mapping) and "sweep" in data:
+        problem = Problem(("sweep",), f"makes several runs of this file: they are started by `rtcd sweep {path}`")
+        raise ConfigError([problem], str(path))
+    return parse(data, str(path))
+
+
+def read_yaml(path: Path) -> Any:
+    """What a YAML file holds, as it stands there; `ConfigError` if there is no such file, or no YAML in it."""
     if not path.is_file():
         there = sorted(str(other) for other in path.parent.glob("*.y*ml"))
         advice = closest(path, there) if there else f"{path.parent} has no YAML file"
         raise ConfigError([Problem((), f"no such file; {advice}")], str(path))
-    return parse_yaml(path.read_bytes(), str(path))
+    return _plain_yaml(path.read_bytes(), str(path))
 
 
 def resolved(config: Config) -> dict[str, Any]:

@@ -9,9 +9,10 @@ import tyro
 from pydantic.fields import FieldInfo
 from tyro.constructors import ConstructorRegistry, StructConstructorSpec, StructFieldSpec, StructTypeInfo
 
-from rtcd_jax.config import EXAMPLE, UNIT, Config, Variable, load, parse, parse_yaml
+from rtcd_jax.config import EXAMPLE, SMALLEST_POPULATION, UNIT, Config, Variable, load, parse, parse_yaml
 from rtcd_jax.errors import UserError
 from rtcd_jax.settings import Settings, bounds
+from rtcd_jax.sweep import Case, read_cases
 
 _COORDINATOR = "where process 0 listens; srun and mpirun need none"
 POLICY_UNITS = {"authority": "-", "discount": "1/s"}
@@ -27,6 +28,32 @@ class Branch:
 
 
 @dataclass(frozen=True)
+class Machines:
+    """The devices of this process, and the other processes of its run."""
+
+    devices: Annotated[int | None, tyro.conf.arg(help="devices to use of those each process sees [-] (all)")] = None
+    cpu_devices: Annotated[int | None, tyro.conf.arg(help="parts the CPU is split into [-] (its cores)")] = None
+    coordinator: Annotated[str | None, tyro.conf.arg(metavar="HOST:PORT", help=_COORDINATOR)] = None
+    num_processes: Annotated[int | None, tyro.conf.arg(help="processes of this run [-] (known under srun)")] = None
+    process_id: Annotated[int | None, tyro.conf.arg(help="this one's number [-] (0 …, known under srun)")] = None
+
+    def require_sense(self) -> None:
+        """Raises `UserError` unless all of coordinator, number and id are given, or none, and all are in range."""
+        for name, least in (("devices", 1), ("cpu_devices", 1), ("num_processes", 1), ("process_id", 0)):
+            value = getattr(self, name)
+            if value is not None and value < least:
+                raise UserError(f"--{name} = {value}: must be >= {least}")
+        together = ("coordinator", "num_processes", "process_id")
+        missing = [f"--{name}" for name in together if getattr(self, name) is None]
+        if 0 < len(missing) < len(together):
+            raise UserError(
+                f"{', '.join(missing)}: must be given too; a process needs all of --{', --'.join(together)}"
+            )
+        if self.num_processes is not None and self.process_id is not None and self.process_id >= self.num_processes:
+            raise UserError(f"--process_id = {self.process_id}: must be < --num_processes = {self.num_processes}")
+
+
+@dataclass(frozen=True)
 class OptimizeOptions:
     """Search for the design and the weights with the largest funnel; the same command resumes a stopped run.
 
@@ -36,11 +63,47 @@ class OptimizeOptions:
     config: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="CONFIG", help="the experiment, a YAML file")]
     settings: Annotated[Branch, tyro.conf.arg(name="")]
     run: Annotated[Path, tyro.conf.arg(metavar="FOLDER", help="run folder, resumed if it is there")]
-    devices: Annotated[int | None, tyro.conf.arg(help="devices to use of those each process sees [-] (all)")] = None
-    cpu_devices: Annotated[int | None, tyro.conf.arg(help="parts the CPU is split into [-] (its cores)")] = None
-    coordinator: Annotated[str | None, tyro.conf.arg(metavar="HOST:PORT", help=_COORDINATOR)] = None
-    num_processes: Annotated[int | None, tyro.conf.arg(help="processes of this run [-] (known under srun)")] = None
-    process_id: Annotated[int | None, tyro.conf.arg(help="this one's number [-] (0 …, known under srun)")] = None
+    machines: Annotated[Machines, tyro.conf.arg(name="")] = Machines()
+
+
+@dataclass(frozen=True)
+class SweepOptions:
+    """Make every run that the `sweep` section of CONFIG asks for, one after another, each in a run folder of its own.
+
+    The same command goes on where an earlier one stopped. --case K makes one of them, as job arrays do; --list only
+    shows them. At the end a table of all cases is printed and stored as FOLDER/table.csv.
+
+    Example: rtcd sweep configs/sweep.yaml --list
+    """
+
+    config: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="CONFIG", help="a YAML with a sweep section")]
+    folder: Annotated[Path | None, tyro.conf.arg(help="of the run folders (checkpoints/NAME)")] = None
+    case: Annotated[int | None, tyro.conf.arg(help="number of the only one to run [-] (0 …)")] = None
+    list: Annotated[bool, tyro.conf.arg(help="show the cases and what is known of them, run nothing")] = False
+    machines: Annotated[Machines, tyro.conf.arg(name="")] = Machines()
+
+
+@dataclass(frozen=True)
+class ScaleOptions:
+    """Measure whole generations against the population and the devices; writes a table and figures.
+
+    Every point runs in a process of its own, on a CPU with a core for each device; what is measured already is kept.
+
+    Example: rtcd scale configs/pendulum_rtcd.yaml --populations 64,256,1024 --devices 1,2
+    """
+
+    config: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="CONFIG", help="the experiment, a YAML file")]
+    populations: Annotated[str, tyro.conf.arg(metavar="P,P,…", help="candidates in a generation [-]")] = "64,256,1024"
+    devices: Annotated[str, tyro.conf.arg(metavar="D,D,…", help="devices to share them out over [-]")] = "1,2"
+    repeats: Annotated[int, tyro.conf.arg(help="timed generations of each point [-] (>= 1)")] = 5
+    folder: Annotated[Path | None, tyro.conf.arg(help="of points, table and figures (checkpoints/scale_NAME)")] = None
+
+    def counts(self, name: str) -> tuple[int, ...]:
+        """The numbers of a list; `UserError` for one that is no number."""
+        try:
+            return tuple(int(word) for word in getattr(self, name).split(","))
+        except ValueError:
+            raise UserError(f"--{name} = {getattr(self, name)}: must be whole numbers, split by commas") from None
 
 
 @dataclass(frozen=True)
@@ -92,7 +155,9 @@ class ReplayOptions:
 
     run: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RUN", help="the run folder")]
     file: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="FILE", help="the measured states, a CSV file")]
-    elite: Annotated[int, tyro.conf.arg(metavar="K", help="whose funnel; 0 is the best [-] (>= 0)")] = 0
+    elite: Annotated[
+        int | Literal["initial"], tyro.conf.arg(metavar="K", help="whose funnel; 0 is the best [-] (>= 0); or initial")
+    ] = 0
 
 
 @dataclass(frozen=True)
@@ -162,6 +227,32 @@ class AuditOptions:
         return found
 
 
+@dataclass(frozen=True)
+class DisturbOptions:
+    """Try the initial candidate and the best elite: off-nominal starts, pushes, wrong models, noise, delay.
+
+    Example: rtcd disturb checkpoints/pendulum_rtcd --states 1000
+    """
+
+    run: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RUN", help="the run folder")]
+    states: Annotated[int, tyro.conf.arg(help="uniform states of every first ellipsoid [-] (>= 1)")] = 1000
+    seed: Annotated[int, tyro.conf.arg(help="of states, noise and perturbations [-] (>= 0)")] = 0
+
+
+@dataclass(frozen=True)
+class ExportOptions:
+    """Write an elite for a lab: controller and funnel monitor in Python and C, tables, MJCF and URDF.
+
+    Example: rtcd export checkpoints/pendulum_rtcd --to lab/pendulum
+    """
+
+    run: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RUN", help="the run folder")]
+    to: Annotated[Path, tyro.conf.arg(metavar="DIR", help="a new or empty folder, or a former export, to replace it")]
+    elite: Annotated[
+        int | Literal["initial"], tyro.conf.arg(metavar="K", help="0 is the best [-] (>= 0); or initial")
+    ] = 0
+
+
 def read_optimize(arguments: Sequence[str], runs: Path) -> tuple[Config, OptimizeOptions]:
     """The configuration with its overrides, and the options beside it.
 
@@ -175,22 +266,30 @@ def read_optimize(arguments: Sequence[str], runs: Path) -> tuple[Config, Optimiz
     else:
         raise UserError(f"the configuration comes first, but found {arguments[0]!r}: {OPTIMIZE_USAGE}")
     options = _parse(arguments, OptimizeOptions(config=tyro.MISSING, settings=_config_branch(defaults), run=folder))
-    _require_processes(options)
+    options.machines.require_sense()
     return parse(options.settings, f"{options.config} with the options given"), options
 
 
-def _require_processes(options: OptimizeOptions) -> None:
-    """All of coordinator, number and id, or none of them."""
-    for name, smallest in (("devices", 1), ("cpu_devices", 1), ("num_processes", 1), ("process_id", 0)):
-        value = getattr(options, name)
-        if value is not None and value < smallest:
-            raise UserError(f"--{name} = {value}: must be >= {smallest}")
-    together = {name: getattr(options, name) for name in ("coordinator", "num_processes", "process_id")}
-    missing = [f"--{name}" for name, value in together.items() if value is None]
-    if 0 < len(missing) < len(together):
-        raise UserError(f"{', '.join(missing)}: must be given too; a process needs all of --{', --'.join(together)}")
-    if options.process_id is not None and options.process_id >= options.num_processes:
-        raise UserError(f"--process_id = {options.process_id}: must be < --num_processes = {options.num_processes}")
+def read_sweep(arguments: Sequence[str], runs: Path) -> tuple[list[Case], SweepOptions]:
+    """All cases of the sweep, and the options. Raises `UserError` for a wrong YAML or a case that is not there."""
+    options = tyro.cli(SweepOptions, args=arguments, prog="rtcd sweep", use_underscores=True)
+    options.machines.require_sense()
+    options = replace(options, folder=options.folder or runs / options.config.stem)
+    cases = read_cases(options.config, options.folder)
+    if options.case is not None and not 0 <= options.case < len(cases):
+        raise UserError(f"--case = {options.case}: must be one of 0 … {len(cases) - 1}")
+    return cases, options
+
+
+def read_scale(arguments: Sequence[str], runs: Path) -> tuple[Config, ScaleOptions]:
+    """The configuration and the options; `UserError` for a wrong YAML or number."""
+    options = tyro.cli(ScaleOptions, args=arguments, prog="rtcd scale", use_underscores=True)
+    if options.repeats < 1:
+        raise UserError(f"--repeats = {options.repeats}: must be >= 1")
+    for name, least in (("populations", SMALLEST_POPULATION), ("devices", 1)):
+        if min(options.counts(name)) < least:
+            raise UserError(f"--{name} = {getattr(options, name)}: all must be >= {least}")
+    return load(options.config), replace(options, folder=options.folder or runs / f"scale_{options.config.stem}")
 
 
 def read_verify(arguments: Sequence[str]) -> VerifyOptions:
@@ -225,8 +324,8 @@ def read_animate(arguments: Sequence[str]) -> AnimateOptions:
 def read_replay(arguments: Sequence[str]) -> ReplayOptions:
     """The checked options of `rtcd replay`; `UserError` if one is out of range."""
     options = tyro.cli(ReplayOptions, args=arguments, prog="rtcd replay", use_underscores=True)
-    if options.elite < 0:
-        raise UserError(f"--elite = {options.elite}: must be >= 0")
+    if isinstance(options.elite, int) and options.elite < 0:
+        raise UserError(f"--elite = {options.elite}: must be >= 0, or initial")
     _require_run(options.run)
     return options
 
@@ -237,6 +336,26 @@ def read_certify(arguments: Sequence[str]) -> CertifyOptions:
     for name in ("elites", "workers"):
         if getattr(options, name) < 1:
             raise UserError(f"--{name} = {getattr(options, name)}: must be >= 1")
+    _require_run(options.run)
+    return options
+
+
+def read_disturb(arguments: Sequence[str]) -> DisturbOptions:
+    """The checked options of `rtcd disturb`; `UserError` if one is out of range."""
+    options = tyro.cli(DisturbOptions, args=arguments, prog="rtcd disturb", use_underscores=True)
+    if options.states < 1:
+        raise UserError(f"--states = {options.states}: must be >= 1")
+    if options.seed < 0:
+        raise UserError(f"--seed = {options.seed}: must be >= 0")
+    _require_run(options.run)
+    return options
+
+
+def read_export(arguments: Sequence[str]) -> ExportOptions:
+    """The checked options of `rtcd export`; `UserError` if one is out of range."""
+    options = tyro.cli(ExportOptions, args=arguments, prog="rtcd export", use_underscores=True)
+    if isinstance(options.elite, int) and options.elite < 0:
+        raise UserError(f"--elite = {options.elite}: must be >= 0, or initial")
     _require_run(options.run)
     return options
 

@@ -142,7 +142,7 @@ def _filled(elites: Elites) -> list[Evaluation]:
     return [_row(records, k) for k in range(int(elites.count))]
 
 
-def _stacked(evaluations: Sequence[Evaluation], elites: Elites) -> Evaluation:
+def _stacked(evaluations: list[Evaluation], elites: Elites) -> Evaluation:
     """As many records as the archive has slots; what stands in the empty ones does not matter."""
     rows = [*evaluations, *evaluations[-1:] * (len(elites.costs) - len(evaluations))]
     return jax.tree.map(lambda *leaves: np.stack(leaves), *rows)

@@ -8,7 +8,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import final
+from typing import Any, cast, final
 
 import jax
 import jax.numpy as jnp
@@ -39,11 +39,11 @@ class Spread:
     def take(self, rows: Int[np.ndarray, " E"]) -> Evaluation:
         """The whole records [E] of these candidates, in numpy."""
         size = self._parts[0].status.shape[0]
-        found = None
-        for index in np.unique(rows // size):
+        first, *others = np.unique(rows // size)
+        found = self._fetch(self._parts[first], rows % size)
+        for index in others:
             part = self._fetch(self._parts[index], rows % size)
-            here = rows // size == index
-            found = part if found is None else jax.tree.map(partial(_where, here), part, found)
+            found = jax.tree.map(partial(_where, rows // size == index), part, found)
         return found
 
 
@@ -71,7 +71,8 @@ def spread(evaluate: Evaluate, cluster: Cluster, chunk: int) -> Callable[[Float[
 
 
 def _seen(cluster: Cluster, part: Evaluation) -> tuple[np.ndarray, Volumes]:
-    while not part.status.is_ready():
+    done = cast(Any, part.status).is_ready
+    while not done():
         time.sleep(POLL)
     cluster.look()
     return cluster.gathered((part.status, replace(part.volumes, per_knot=part.volumes.per_knot[:, :0])))

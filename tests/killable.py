@@ -2,7 +2,8 @@
 
     python -m tests.killable FOLDER MODE SECONDS [DEVICES [PORT PROCESSES ID]]
 
-SECONDS is the least time of a generation, DEVICES those of this process; PORT is where process 0 of PROCESSES listens.
+SECONDS is the least time of a generation, DEVICES those of this process; PORT is where process 0 of PROCESSES
+listens; srun tells these by itself.
 """
 
 import os
@@ -18,8 +19,7 @@ from rtcd_jax.cluster import Cluster, Lost, join
 def main(path, mode, seconds, devices="1", port=None, processes="1", index="0"):
     jax.config.update("jax_enable_x64", True)
     jax.config.update("jax_num_cpu_devices", int(devices))
-    if port is not None:
-        join(f"127.0.0.1:{port}", int(processes), int(index))
+    join(*(() if port is None else (f"127.0.0.1:{port}", int(processes), int(index))))
     from tests.search_driver import drive, experiment  # imports that touch a device
 
     cluster = Cluster.of()

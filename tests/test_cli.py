@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 from rtcd_jax import cli
+from rtcd_jax.backend import cores
 from rtcd_jax.config import Config, load, resolved
 
 ROOT = Path(__file__).parent.parent
@@ -95,7 +96,7 @@ def test_help_shows_the_file_s_own_values(tmp_path):
 
 
 WRONG = {
-    "misspelt verb": (["optimise"], "unknown command 'optimise'; did you mean 'optimize'? Valid: optimize, verify"),
+    "misspelt verb": (["optimise"], "unknown command 'optimise'; did you mean 'optimize'? Valid: optimize, sweep"),
     "no file": (["optimize", "configs/pendulum_rtcdd.yaml"], "no such file; did you mean 'configs/pendulum_rtcd.yaml'"),
     "no arguments": (["optimize"], "Missing from rtcd optimize: CONFIG"),
     "option first": (["optimize", "--run", "x", RTCD], "the configuration comes first, but found '--run'"),
@@ -108,13 +109,23 @@ WRONG = {
     "no run": (["verify", "no/such/run"], "no/such/run: no such run folder"),
     "no states": (["verify", "configs", "--states", "0"], "--states = 0: must be >= 1"),
     "negative seed": (["verify", "configs", "--seed", "-1"], "--seed = -1: must be >= 0"),
+    "no run to disturb": (["disturb", "no/such/run"], "no/such/run: no such run folder"),
+    "nothing to disturb": (["disturb", "configs", "--states", "0"], "--states = 0: must be >= 1"),
+    "negative seed of noise": (["disturb", "configs", "--seed", "-1"], "--seed = -1: must be >= 0"),
+    "no run to export": (["export", "no/such/run", "--to", "x"], "no/such/run: no such run folder"),
+    "negative elite": (["export", "configs", "--to", "x", "--elite", "-1"], "--elite = -1: must be >= 0, or initial"),
+    "no such elite's name": (["export", "configs", "--to", "x", "--elite", "best"], "--elite"),
+    "nowhere to export to": (["export", "configs"], "--to"),
     "no run to report": (["report"], "which run? rtcd report RUN [RUN …] [--to FILE]"),
     "no such run to report": (["report", "configs", "no/such/run"], "no/such/run: no such run folder"),
     "no such run to animate": (["animate", "no/such/run"], "no/such/run: no such run folder"),
     "negative seed to animate": (["animate", "configs", "--seed", "-1"], "--seed = -1: must be >= 0"),
     "no such run to replay": (["replay", "no/such/run", "x.csv"], "no/such/run: no such run folder"),
     "nothing to replay": (["replay", "configs"], "FILE"),
-    "negative elite to replay": (["replay", "configs", "x.csv", "--elite", "-1"], "--elite = -1: must be >= 0"),
+    "negative elite to replay": (
+        ["replay", "configs", "x.csv", "--elite", "-1"],
+        "--elite = -1: must be >= 0, or initial",
+    ),
     "misspelt verify option": (["verify", "configs", "--sed", "1"], "--seed"),
 }
 
@@ -155,7 +166,7 @@ def run_module(monkeypatch):
     module = types.ModuleType("rtcd_jax.run")
     module.optimize = lambda config, folder, console, cluster: calls.append((config, folder))
     monkeypatch.setitem(sys.modules, "rtcd_jax.run", module)
-    monkeypatch.setattr(cli, "_prepare_jax", lambda *_: None)
+    monkeypatch.setattr(cli, "prepare_jax", lambda *_: None)
     monkeypatch.setattr("rtcd_jax.cluster.Cluster.heed", lambda cluster: None)  # signals stay pytest's
     module.calls = calls
     return module
@@ -218,7 +229,7 @@ def test_verify_exits_by_the_promise(monkeypatch, tmp_path, held, code):
     module = types.ModuleType("rtcd_jax.verify")
     module.verify_run = lambda folder, states, seed, workers, console: calls.append((folder, states, seed)) or held
     monkeypatch.setitem(sys.modules, "rtcd_jax.verify", module)
-    monkeypatch.setattr(cli, "_prepare_jax", lambda *_: None)
+    monkeypatch.setattr(cli, "prepare_jax", lambda *_: None)
     assert cli.main(["verify", str(tmp_path), "--states", "10", "--seed", "3"]) == code
     assert calls == [(tmp_path, 10, 3)]
 
@@ -229,30 +240,56 @@ def test_replay_exits_by_the_funnel(monkeypatch, tmp_path, kept, code):
     module = types.ModuleType("rtcd_jax.report.replay")
     module.replay_run = lambda folder, file, elite, console: calls.append((folder, file, elite)) or kept
     monkeypatch.setitem(sys.modules, "rtcd_jax.report.replay", module)
-    assert cli.main(["replay", str(tmp_path), "lab.csv", "--elite", "2"]) == code
-    assert calls == [(tmp_path, Path("lab.csv"), 2)]
+    for elite in ("2", "initial"):
+        assert cli.main(["replay", str(tmp_path), "lab.csv", "--elite", elite]) == code
+    assert calls == [(tmp_path, Path("lab.csv"), 2), (tmp_path, Path("lab.csv"), "initial")]
 
 
 @pytest.mark.parametrize(
     ("verb", "arguments"), [("report", ["."]), ("animate", ["."]), ("replay", [".", "measured.csv"])]
 )
 def test_what_is_no_run_folder_is_told_in_one_line(verb, arguments, tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(cli, "_prepare_jax", lambda: None)
+    monkeypatch.setattr(cli, "prepare_jax", lambda: None)
     monkeypatch.chdir(tmp_path)
     assert cli.main([verb, *arguments]) == 2
     assert capsys.readouterr().err == "rtcd: . is no run folder: it has no format.json\n"
 
 
-@pytest.mark.parametrize("verb", ["report", "animate", "replay"])
+@pytest.mark.parametrize("verb", ["report", "animate", "replay", "disturb", "export"])
 def test_help_has_an_example(verb):
     code, output, _ = rtcd(verb, "--help")
     assert code == 0
     assert f"Example: rtcd {verb} checkpoints/" in flat(output)
 
 
+def _standing_in(monkeypatch, name, verb):
+    """The module in the place of the one that the verb imports, and the calls that it gets."""
+    calls = []
+    module = types.ModuleType(f"rtcd_jax.{name}")
+    setattr(module, verb, lambda *arguments: calls.append(arguments[:-1]))
+    monkeypatch.setitem(sys.modules, f"rtcd_jax.{name}", module)
+    monkeypatch.setattr(cli, "prepare_jax", lambda: None)
+    return calls
+
+
+def test_export_hands_on_the_elite_and_the_folder(monkeypatch, tmp_path):
+    calls = _standing_in(monkeypatch, "export", "export_run")
+    assert cli.main(["export", str(tmp_path), "--to", "lab"]) == 0
+    assert cli.main(["export", str(tmp_path), "--to", "lab", "--elite", "3"]) == 0
+    assert cli.main(["export", str(tmp_path), "--to", "lab", "--elite", "initial"]) == 0
+    assert calls == [(tmp_path, elite, Path("lab")) for elite in (0, 3, "initial")]
+
+
+def test_disturb_hands_on_states_and_seed(monkeypatch, tmp_path):
+    calls = _standing_in(monkeypatch, "disturb", "disturb_run")
+    assert cli.main(["disturb", str(tmp_path)]) == 0
+    assert cli.main(["disturb", str(tmp_path), "--states", "10", "--seed", "3"]) == 0
+    assert calls == [(tmp_path, 1000, 0), (tmp_path, 10, 3)]
+
+
 PREPARED = """
-from rtcd_jax.cli import _prepare_jax
-_prepare_jax()
+from rtcd_jax.backend import prepare_jax
+prepare_jax()
 import jax
 print(jax.device_count(), jax.numpy.zeros(1).dtype)
 """
@@ -265,7 +302,7 @@ def prepared(environment):
 
 
 def test_double_precision_on_every_core():
-    assert prepared({}) == f"{cli._cores()} float64"
+    assert prepared({}) == f"{cores()} float64"
 
 
 @pytest.mark.parametrize(

@@ -11,9 +11,9 @@ PACKAGE = Path(__file__).parent.parent / "rtcd_jax"
 
 # From the bottom up; a module imports from its own layer and those below it. A folder stands for all its modules.
 LAYERS = (
-    {"errors", "numerics", "files", "provenance"},
+    {"errors", "numerics", "files", "provenance", "backend"},
     {"settings", "types", "console"},
-    {"config"},
+    {"config", "sweep"},
     {"plants"},
     {"problem"},
     {"population", "trajectory", "policy", "rollout"},
@@ -24,8 +24,9 @@ LAYERS = (
     {"cmaes", "elites", "loops"},
     {"search"},
     {"storage"},
-    {"verify", "options", "certificate", "report"},
-    {"run"},
+    {"verify", "options", "reference", "certificate", "report"},
+    {"export", "disturb"},
+    {"run", "scale"},
     {"cli"},
 )
 
@@ -37,13 +38,13 @@ OWNERS = {
     "flint": {"certificate"},
     "orbax": {"storage"},
     "evosax": {"cmaes"},
-    "rich": {"console", "verify", "certificate", "report"},
+    "rich": {"console", "sweep", "scale", "verify", "certificate", "report"},
     "tyro": {"options"},
-    "yaml": {"config"},
-    "matplotlib": {"report"},
+    "yaml": {"config", "export"},
+    "matplotlib": {"report", "scale"},
     "PIL": {"report"},
     "imageio_ffmpeg": {"report"},
-    "pydantic": {"settings", "config", "options"},
+    "pydantic": {"settings", "config", "options", "reference"},
     "pydantic_core": {"settings"},
 }
 

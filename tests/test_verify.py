@@ -90,7 +90,7 @@ def _oracle(elite: Elite, k: int, x: np.ndarray) -> np.ndarray:
 
 def _outcomes(elite: Elite, knots, states):
     states = np.atleast_2d(np.asarray(states, float))
-    return [simulate(elite, f, march, np.asarray(knots), states) for _, f, march in witnesses(elite, len(states))]
+    return [simulate(elite, f, march, np.asarray(knots), states) for _, f, march, _ in witnesses(elite, len(states))]
 
 
 def test_a_small_funnel_about_the_upright_keeps_its_promise():
@@ -126,7 +126,7 @@ def test_the_witnesses_agree_on_every_state(level):
 def test_an_interval_under_the_loop_is_that_of_its_definition(witness, smooth, kinked):
     """The last state crosses the torque limit inside a step: there a method of any order is one of the second."""
     elite = _moving()
-    _, f, march = list(witnesses(elite, 4))[witness]
+    _, f, march, _ = list(witnesses(elite, 4))[witness]
     offsets = np.array([[0.0, 0.0], [0.05, -0.1], [-0.1, 0.2], [0.6, 1.0]])
     tolerances = np.array([smooth, smooth, smooth, kinked])[:, None]
     for k in range(len(elite.u)):
@@ -152,7 +152,7 @@ def test_mujocos_own_steps_with_held_inputs_converge_to_the_loop():
             mujoco.mj_step(model, data)
         return np.concatenate([data.qpos, data.qvel])
 
-    _, f, march = next(witnesses(elite, 1))
+    _, f, march, _ = next(witnesses(elite, 1))
     *_, end = march(tracking(elite, f, 0), 0.0, 0.05, x0[None])
     coarse, fine = (np.linalg.norm(stepped(steps) - end[0]) for steps in (200, 400))
     assert fine < 1e-3

@@ -4,13 +4,13 @@ import datetime
 import json
 import os
 import platform
-import resource
-import time
-from collections.abc import Callable
 from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
 from typing import Any
+
+from rtcd_jax.backend import prepare_jax
+from rtcd_jax.scale.clock import Timed, peak_memory, timed
 
 RESULTS = Path(__file__).parent / "results"
 CONFIG = Path(__file__).parents[2] / "configs" / "pendulum_rtcd.yaml"
@@ -43,35 +43,6 @@ def save(name: str, record: dict[str, Any], folder: Path = RESULTS) -> Path:
 
 
 @dataclass(frozen=True)
-class Timed:
-    """One call: wall clock and CPU time of all threads [s]."""
-
-    wall: float
-    cpu: float
-
-
-def timed(call: Callable[[], Any]) -> tuple[Any, Timed]:
-    wall, cpu = time.perf_counter(), time.process_time()
-    value = call()
-    return value, Timed(time.perf_counter() - wall, time.process_time() - cpu)
-
-
-def prepare_jax() -> None:
-    """Double precision and XLA's options as the command line sets them, on one device; before jax is used."""
-    from rtcd_jax.cli import CPU_FLAGS
-
-    os.environ.setdefault("XLA_FLAGS", " ".join(CPU_FLAGS))
-    import jax
-
-    jax.config.update("jax_enable_x64", True)
-
-
-def peak_memory() -> int:
-    """Largest resident size of this process so far [bytes]."""
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
-
-
-@dataclass(frozen=True)
 class Measured:
     """rtcd_jax's pipeline for one population: compilation, repeated calls on fresh genomes, memory [bytes]."""
 
@@ -89,7 +60,7 @@ def measure_pipeline(config: Path, population: int, repeats: int) -> Measured:
 
     Genomes are uniform in the unit box of the search. `with_funnel` is the share of candidates whose status is OK.
     """
-    prepare_jax()
+    prepare_jax(1)
     import jax
 
     from rtcd_jax.config import load

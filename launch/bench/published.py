@@ -11,7 +11,8 @@ from pathlib import Path
 
 import jax
 import jax.numpy as jnp
-from measure import prepare_jax
+
+from rtcd_jax.backend import prepare_jax
 
 CONFIGS = Path(__file__).parents[2] / "configs"
 CANDIDATES = {  # the design variables, then the diagonals of Q and R (paper, table I and the authors' results)
@@ -32,18 +33,21 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("robot", nargs="?", choices=CANDIDATES, default="pendulum")
     robot = parser.parse_args().robot
-    prepare_jax()
+    prepare_jax(1)
+    from rtcd_jax import search
     from rtcd_jax.config import load
     from rtcd_jax.evaluation import elite_effort, make_evaluate
-    from rtcd_jax.population import encode
+    from rtcd_jax.population import encode, initial_genome
     from rtcd_jax.problem import make_problem
 
-    problem = make_problem(load(CONFIGS / f"{robot}_rtcd.yaml"))
+    config = load(CONFIGS / f"{robot}_rtcd.yaml")
+    problem = make_problem(config)
+    plan = search.Plan(config.search, config.elites, tuple(initial_genome(problem).tolist()), problem.design_dims)
     evaluate = jax.jit(make_evaluate(problem, elite_effort(problem)))
     found = {}
     for name, values in CANDIDATES[robot].items():
         genome = jnp.asarray(encode(problem, values))
-        found[name] = jax.tree.map(lambda leaf: leaf[0], evaluate(genome[None], jax.random.key(0)))
+        found[name] = jax.tree.map(lambda leaf: leaf[0], evaluate(genome[None], search.last_key(plan)))
     print(f"{'volume (sampled)':16}" + "".join(f"{name:>24}" for name in found))
     for label, field in VOLUMES.items():
         values = [float(getattr(evaluation.volumes, field)) for evaluation in found.values()]

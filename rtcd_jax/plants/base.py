@@ -23,6 +23,9 @@ class Plant(eqx.Module):
     input_names: ClassVar[tuple[str, ...]]
     input_units: ClassVar[tuple[str, ...]]
     design_units: ClassVar[dict[str, str]]
+    parameter_units: ClassVar[dict[str, str]]
+    convention: ClassVar[str]
+    """Where the positions are zero, and which way positions, velocities and inputs point."""
     Design: ClassVar[type[eqx.Module]]
     mjcf: ClassVar[Path]
 

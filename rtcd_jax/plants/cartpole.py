@@ -55,6 +55,15 @@ class Cartpole(Plant):
     input_names: ClassVar = ("force",)
     input_units: ClassVar = ("N",)
     design_units: ClassVar = {"pole_length": "m", "pole_mass": "kg"}
+    parameter_units: ClassVar = {
+        "Mc": "kg", "Mp": "kg", "lp": "m", "inertia_about_com": "kg m^2", "Beq": "N s/m", "Bp": "N m s/rad",
+        "g": "m/s^2", "force_limit": "N",
+    }  # fmt: skip
+    convention: ClassVar = (
+        "cart = 0 is the middle of the rail, positive cart, cart_dot and force point along +x; theta = 0 stands "
+        "upright, pi hangs; seen with the x axis to the right and z up, positive theta and theta_dot turn "
+        "counterclockwise, a standing pole towards -x. Not wrapped: a full turn adds 2 pi."
+    )
     Design: ClassVar = CartpoleDesign
     mjcf: ClassVar = Path(__file__).with_name("cartpole.xml")
 

@@ -38,6 +38,11 @@ class Pendulum(Plant):
     input_names: ClassVar = ("torque",)
     input_units: ClassVar = ("N m",)
     design_units: ClassVar = {"mass": "kg", "length": "m"}
+    parameter_units: ClassVar = {"m": "kg", "l": "m", "b": "N m s/rad", "g": "m/s^2", "torque_limit": "N m"}
+    convention: ClassVar = (
+        "theta = 0 hangs, pi stands upright; seen with the x axis to the right and z up, positive theta, theta_dot and "
+        "torque turn counterclockwise, a hanging pendulum towards +x. Not wrapped: a full turn adds 2 pi."
+    )
     Design: ClassVar = PendulumDesign
     mjcf: ClassVar = Path(__file__).with_name("pendulum.xml")
 

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from rtcd_jax.config import Config
-from rtcd_jax.report.canvas import BLACK, GRAY, LIGHT, WIDTH, blank, written
+from rtcd_jax.report.canvas import BLACK, GRAY, LIGHT, SMALL, WIDTH, blank, written
 from rtcd_jax.report.reading import Run, Shown, shown
 from rtcd_jax.report.shapes import outlines, planes, projections
 from rtcd_jax.report.words import VOLUMES, listed, quantity, rung, volume_unit, words
@@ -17,6 +17,9 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.cm import ScalarMappable
     from matplotlib.figure import Figure
+
+MANY = 100
+"""Knots from which on lines and marks are finer, and outlines coarser."""
 
 
 def draw_funnels(run: Run) -> list[Path]:
@@ -30,7 +33,7 @@ def draw_funnels(run: Run) -> list[Path]:
     """
     with blank((WIDTH, 2.9 * len(planes(run.best.x.shape[1])) + 3.1)) as figure:
         _beside(figure, run)
-        return written(figure, run.path / "figures", "funnel")
+        return written(figure, run.figures, "funnel")
 
 
 def draw_levels(run: Run) -> list[Path]:
@@ -45,11 +48,11 @@ def draw_levels(run: Run) -> list[Path]:
         for axes in (levels, volumes):
             axes.grid(axis="y", lw=0.4, color=LIGHT)
         figure.legend(handles=levels.lines, title=rung(run.best.record), ncols=2, loc="outside upper center")
-        return written(figure, run.path / "figures", "levels")
+        return written(figure, run.figures, "levels")
 
 
 def draw_over(runs: Sequence[Run], folder: Path, name: str) -> list[Path]:
-    """Draws the funnels of several runs over one another, as the paper does, and their volumes over time.
+    """Draws the funnels of one run or several over one another, as the paper does, and their volumes over time.
 
     The largest lies lowest. Raises UserError if the folder cannot be written.
     """
@@ -61,10 +64,11 @@ def draw_over(runs: Sequence[Run], folder: Path, name: str) -> list[Path]:
             frame(axes, config, plane, window(funnels, plane))
         figure.legend(**told_once(panels), loc="outside upper center")
         for funnel in funnels:
-            volumes.semilogy(funnel.time, funnel.per_knot, color=funnel.color, label=_told(config, funnel))
+            volumes.semilogy(funnel.time, funnel.per_knot, color=funnel.color, label=_told_briefly(funnel))
         volumes.set(xlabel="time [s]", ylabel=f"volume of a knot's\nellipsoid [{volume_unit(config)}]")
         volumes.grid(axis="y", lw=0.4, color=LIGHT)
-        figure.legend(handles=volumes.lines, loc="outside lower center")
+        units = f"volumes in {volume_unit(config)}, integrals in {volume_unit(config, 'integral')}"
+        figure.legend(handles=volumes.lines, title=units, title_fontsize=SMALL, loc="outside lower center")
         return written(figure, folder, name)
 
 
@@ -79,14 +83,17 @@ def draw_shadows(axes: "Axes", funnels: Sequence[Shown], plane: tuple[int, int])
         curves = list(shadow(funnel, plane))
         # One curve of all ellipses is filled once: their shades do not add up where they overlap.
         whole = Curve.make_compound_path(*map(Curve, curves))
-        axes.add_patch(PathPatch(whole, facecolor=to_rgba(funnel.color, 0.15), lw=0))
+        # add_patch would look at every segment for limits that are set anyway.
+        axes.add_artist(PathPatch(whole, facecolor=to_rgba(funnel.color, 0.15), lw=0))
         edges = to_rgba(funnel.color, 0.45)
-        axes.add_collection(PolyCollection(curves, facecolors="none", edgecolors=edges, lw=0.5))
+        width = 0.5 if len(curves) <= MANY else 0.25
+        axes.add_collection(PolyCollection(curves, facecolors="none", edgecolors=edges, lw=width))
         axes.plot(*funnel.x[:, plane].T, color=funnel.color, label=funnel.label, zorder=3)
 
 
-def shadow(funnel: Shown, plane: tuple[int, int], points: int = 181) -> Float[np.ndarray, "knots points 2"]:
+def shadow(funnel: Shown, plane: tuple[int, int], points: int | None = None) -> Float[np.ndarray, "knots points 2"]:
     """Outlines of a funnel's ellipsoids in a plane."""
+    points = points or (181 if len(funnel.time) <= MANY else 91)
     return outlines(funnel.x[:, plane], projections(funnel.S, funnel.rho, plane), points)
 
 
@@ -135,10 +142,11 @@ def _beside(figure: "Figure", run: Run) -> None:
 
 
 def told_once(panels: Sequence["Axes"]) -> dict[str, Any]:
-    """The entries of a legend, in one row, for all that the panels have in common."""
+    """The entries of a legend for all that the panels have in common, in one row where they fit."""
     found = [zip(*axes.get_legend_handles_labels(), strict=True) for axes in panels]
     handles = {label: handle for pairs in found for handle, label in pairs}
-    return {"handles": list(handles.values()), "labels": list(handles), "ncols": min(len(handles), 6)}
+    columns = len(handles) if len(handles) <= 6 else 4
+    return {"handles": list(handles.values()), "labels": list(handles), "ncols": columns}
 
 
 def _time_colors(duration: float) -> "ScalarMappable":
@@ -183,6 +191,12 @@ def _told(config: Config, funnel: Shown) -> str:
     """The four volumes with their rung, which no volume is told without."""
     told = [f"{words(name)} {funnel.volumes[name]:.4g} {volume_unit(config, name)}" for name in VOLUMES]
     return f"{funnel.label}: {', '.join(told)}\n{rung(funnel.record)}"
+
+
+def _told_briefly(funnel: Shown) -> str:
+    told = [f"{words(name)} {funnel.volumes[name]:.3g}" for name in VOLUMES]
+    promise = f", ε = {funnel.record['epsilon']:.2g}" if funnel.record["rung"] == "sampled" else ""
+    return f"{funnel.label}: {', '.join(told)} ({funnel.record['rung']}{promise})"
 
 
 def _title(config: Config, funnel: Shown) -> str:

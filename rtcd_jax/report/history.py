@@ -14,6 +14,8 @@ from rtcd_jax.report.words import letter, words
 Generations = Sequence[Mapping[str, Any]]
 QUANTILES = (10, 90)
 """Percentiles between which a population's spread is drawn."""
+POLICY = {"authority": "authority [-]", "discount": "discount [1/s]"}
+"""What the policy's searched options are called."""
 
 
 def column(generations: Generations, name: str) -> Float[np.ndarray, " generations"]:
@@ -42,23 +44,24 @@ def failures(generations: Generations) -> dict[str, Float[np.ndarray, " generati
 def searched(config: Config) -> dict[str, tuple[Variable, str]]:
     """The free variables by their dotted names, in the order of the genome, with what they are called and units."""
     plant = config.plant
-    titles = [f"{words(name)} [{unit}]" for name, unit in plant.design.items()]
+    titles = {f"design.{name}": f"{words(name)} [{unit}]" for name, unit in plant.design.items()}
     for sign, named in (("q", plant.states), ("r", plant.inputs)):
-        titles += [
-            f"{sign}{i} of {letter(name)} [1/(s {_squared(unit)})]" for i, (name, unit) in enumerate(named.items(), 1)
-        ]
-    return {
-        name: (variable, title)
-        for (name, variable), title in zip(config.variables().items(), titles, strict=True)
-        if variable.free
-    }
+        for i, (name, unit) in enumerate(named.items()):
+            titles[f"weights.{sign}.{i}"] = f"{sign}{i + 1} of {letter(name)} [1/(s {_squared(unit)})]"
+    titles |= {f"policy.{name}": title for name, title in POLICY.items()}
+    return {name: (variable, titles[name]) for name, variable in config.variables().items() if variable.free}
+
+
+def logarithmic(name: str) -> bool:
+    """Whether the search scales a variable logarithmically."""
+    return name.startswith("weights.") or name == "policy.authority"
 
 
 def physical(name: str, variable: Variable, shares: np.ndarray) -> np.ndarray:
-    """The values that shares of a variable's box stand for: designs linearly, weights logarithmically."""
-    if name.startswith("design."):
-        return variable.min + shares * (variable.max - variable.min)
-    return variable.min * np.exp(shares * log(variable.max / variable.min))
+    """The values that shares of a variable's box stand for, linearly or logarithmically."""
+    if logarithmic(name):
+        return variable.min * np.exp(shares * log(variable.max / variable.min))
+    return variable.min + shares * (variable.max - variable.min)
 
 
 @final
@@ -76,7 +79,7 @@ class Course:
 
     @property
     def logarithmic(self) -> bool:
-        return self.name.startswith("weights.")
+        return logarithmic(self.name)
 
     @property
     def window(self) -> tuple[float, float]:

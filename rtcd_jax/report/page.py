@@ -5,6 +5,7 @@ a click on a heading.
 """
 
 import base64
+import dataclasses
 import html
 import json
 from collections.abc import Iterator, Mapping, Sequence
@@ -34,7 +35,8 @@ def report(folders: Sequence[Path], to: Path | None = None) -> list[Path]:
     """Writes the page of a finished run, or one that compares several, and its figures; the page's path first.
 
     One run: `report.html` and `figures/` in its folder. Several: `comparison.html` beside the first folder, with
-    `comparison.png` and `.pdf`. `to` is another path for the page.
+    `comparison.png` and `.pdf`. `to`, say NAME.html, is another path for the page; then one run's figures are in
+    NAME_figures/ beside it, and the run's folder is only read.
 
     Raises:
         UserError: a folder that is no finished run's, runs of different robots, or a path that cannot be written.
@@ -43,7 +45,8 @@ def report(folders: Sequence[Path], to: Path | None = None) -> list[Path]:
     if to is not None and to.is_dir():
         raise UserError(f"--to = {to}: must be a file, and this is a folder")
     if len(runs) == 1:
-        page, drawn = to or folders[0] / "report.html", draw_figures(runs[0])
+        (run,), page = runs, to or folders[0] / "report.html"
+        drawn = draw_figures(dataclasses.replace(run, figures=to.with_name(f"{to.stem}_figures")) if to else run)
     else:
         runs = compared(runs)
         page = to or folders[0].resolve().parent / "comparison.html"
@@ -53,8 +56,9 @@ def report(folders: Sequence[Path], to: Path | None = None) -> list[Path]:
 
 
 def draw_figures(run: Run) -> list[Path]:
-    """The figures of one run as `figures/NAME.png` and `.pdf`. Raises UserError if they cannot be written."""
-    return [path for draw in (draw_funnels, draw_levels, draw_courses, draw_convergence) for path in draw(run)]
+    """The figures of one run, NAME.png and .pdf in `run.figures`. Raises UserError if they cannot be written."""
+    over = draw_over([run], run.figures, "overlay")
+    return over + [path for draw in (draw_funnels, draw_levels, draw_courses, draw_convergence) for path in draw(run)]
 
 
 def render(runs: Sequence[Run]) -> str:
@@ -97,7 +101,8 @@ def _candidate(run: Run) -> str:
     record = run.best.record
     design = [listed(name, value, run.config.plant.design[name]) for name, value in record["design"].items()]
     weights = [listed(name, value) for name, value in record["weights"].items()]
-    return html.escape("best: " + ", ".join([*design, *weights]))
+    options = [listed(name, record["policy"][name]) for name in run.config.policy.variables()]
+    return html.escape("best: " + ", ".join([*design, *weights, *options]))
 
 
 def _headlines(run: Run) -> Iterator[tuple[str, str, str]]:
@@ -182,7 +187,8 @@ def _certified(runs: Sequence[Run]) -> Iterator[str]:
 def _pictures(found: Experiment) -> Iterator[str]:
     for path in found.pictures:
         data = base64.b64encode(path.read_bytes()).decode()
-        yield f'<img src="data:image/png;base64,{data}" alt="{html.escape(words(path.stem))}">'
+        picture = f'<img src="data:image/png;base64,{data}" alt="{html.escape(words(path.stem))}">'
+        yield f'<div class="scroll">{picture}</div>'
 
 
 def _section(title: str, *parts: str) -> str:

@@ -7,7 +7,7 @@ import numpy as np
 
 from rtcd_jax.config import Config
 from rtcd_jax.report.canvas import BLACK, GRAY
-from rtcd_jax.report.funnels import shadow, window
+from rtcd_jax.report.funnels import MANY, shadow, window
 from rtcd_jax.report.history import Course, column, courses, failures, spread
 from rtcd_jax.report.progress import GREEN, SPREAD, STATUS_COLORS, told_status
 from rtcd_jax.report.reading import BLUE, VERMILION, Run, Shown, shown
@@ -100,7 +100,7 @@ def convergence_plot(run: Run) -> Plot:
             "xaxis": {"title": {"text": "generation"}, "anchor": "y3"},
             "yaxis": {"title": {"text": f"volume ({words(objective)}) [{unit}]"}, "domain": [0.5, 1]},
             "yaxis2": {"title": {"text": "candidates by status"}, "domain": [0.23, 0.45], "range": [0, 1]},
-            "yaxis3": {"title": {"text": "step size σ"}, "domain": [0, 0.18], **_LOG},
+            "yaxis3": {"title": {"text": "step size σ"}, "domain": [0, 0.18], **_scale(column(generations, "sigma"))},
         },
     }
 
@@ -146,6 +146,11 @@ def course_plot(course: Course, index: Sequence[float | None]) -> Plot:
 _LOG: Mapping[str, str] = {"type": "log", "exponentformat": "e"}
 
 
+def _scale(values: np.ndarray) -> Mapping[str, str]:
+    """A logarithmic axis for more than one decade."""
+    return _LOG if np.nanmax(values) > 10 * np.nanmin(values) > 0 else {}
+
+
 def _body(funnel: Shown, plane: tuple[int, int]) -> Plot:
     """All ellipses as one trace, a gap behind each."""
     curves = shadow(funnel, plane, POINTS)
@@ -157,7 +162,7 @@ def _body(funnel: Shown, plane: tuple[int, int]) -> Plot:
         "mode": "lines",
         "fill": "toself",
         "fillcolor": _faint(funnel.color, 0.10),
-        "line": {"color": _faint(funnel.color, 0.45), "width": 0.6},
+        "line": {"color": _faint(funnel.color, 0.45), "width": 0.6 if len(funnel.time) <= MANY else 0.3},
         "name": funnel.label,
         "legendgroup": funnel.label,
         "showlegend": False,
@@ -174,7 +179,7 @@ def _motion(config: Config, funnel: Shown, plane: tuple[int, int]) -> Plot:
         "y": y,
         "mode": "lines+markers",
         "line": {"color": funnel.color, "width": 1.5},
-        "marker": {"size": 4 if len(funnel.time) <= 100 else 2.5},
+        "marker": {"size": 4 if len(funnel.time) <= MANY else 2.5},
         "name": funnel.label,
         "legendgroup": funnel.label,
         "customdata": [_numbers(row) for row in np.stack([funnel.time, funnel.rho, funnel.per_knot], axis=1)],

@@ -35,7 +35,7 @@ def draw_convergence(run: Run) -> list[Path]:
     """
     with blank((WIDTH, 5.8)) as figure:
         _convergence(figure, run.config, run.generations)
-        return written(figure, run.path / "figures", "convergence")
+        return written(figure, run.figures, "convergence")
 
 
 def draw_courses(run: Run) -> list[Path]:
@@ -55,7 +55,7 @@ def draw_courses(run: Run) -> list[Path]:
         handles, labels = panels[0].get_legend_handles_labels()
         figure.legend(handles, labels, loc="outside upper center", ncols=len(labels))
         figure.supxlabel("generation", fontsize=9)
-        return written(figure, run.path / "figures", "courses")
+        return written(figure, run.figures, "courses")
 
 
 def _convergence(figure: "Figure", config: Config, generations: Generations) -> None:

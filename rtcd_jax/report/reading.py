@@ -1,5 +1,6 @@
 """A finished run as reports show it: everything that its folder holds, checked once and given names."""
 
+import itertools
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -17,7 +18,9 @@ from rtcd_jax.storage import elite_names, read_config, read_elite, read_generati
 # Okabe and Ito's colors: told apart by all kinds of color vision.
 BLUE, VERMILION = "#0072B2", "#D55E00"
 COLORS = (VERMILION, "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
-"""Of compared runs, in turn; the initial candidate is blue."""
+"""Of compared runs, in turn."""
+INITIALS = (BLUE, "#5F6B7A", "#8C6D31", "#7A5195")
+"""Of their initial candidates, where they differ."""
 
 
 @final
@@ -64,9 +67,13 @@ class Experiment:
 @final
 @dataclass(frozen=True)
 class Run:
-    """A run folder. `initial` is None where the initial candidate has no funnel, and `absence` says why."""
+    """A run folder. `initial` is None where the initial candidate has no funnel, and `absence` says why.
+
+    `figures` is the folder that they are drawn into.
+    """
 
     path: Path
+    figures: Path
     name: str
     config: Config
     best: Shown
@@ -103,6 +110,7 @@ def read_run(path: Path) -> Run:
     folder = path / "elites"
     return Run(
         path=path,
+        figures=path / "figures",
         name=path.resolve().name,
         config=config,
         best=best,
@@ -172,12 +180,13 @@ def shown(runs: Sequence[Run]) -> list[Shown]:
             initials.append(run.initial)
     if len(initials) == 1:
         initials = [replace(initials[0], label="initial")]
-    return [*initials, *(run.best for run in runs)]
+    colors = itertools.cycle(INITIALS)
+    return [*(replace(initial, color=next(colors)) for initial in initials), *(run.best for run in runs)]
 
 
 def _same(first: Shown, second: Shown) -> bool:
-    """Whether two funnels are one candidate's."""
-    return np.array_equal(first.x, second.x) and np.array_equal(first.rho, second.rho)
+    """Whether two funnels are one candidate's: the same motion and values, however their levels were sampled."""
+    return first.x.shape == second.x.shape and np.allclose(first.x, second.x) and np.allclose(first.S, second.S)
 
 
 def _experiments(folder: Path) -> list[Experiment]:

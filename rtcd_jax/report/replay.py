@@ -68,18 +68,19 @@ class Replay:
         }
 
 
-def replay_run(folder: Path, file: Path, elite: int, console: Console) -> bool:
-    """Replays a measured file against an elite's funnel; True if every sample was inside.
+def replay_run(folder: Path, file: Path, elite: int | str, console: Console) -> bool:
+    """Replays a measured file against the funnel of an elite, or of the candidate "initial"; True if it stayed inside.
 
     Writes `replay/NAME.csv`, `.json`, `.png` and `.pdf`, NAME that of the measured file.
 
     Raises:
         UserError: no run folder, no such elite, a file that is no measured motion, or a folder that cannot be written.
     """
-    config, name = read_config(folder), f"{elite:03d}"
+    config = read_config(folder)
+    name, place = (f"{elite:03d}", folder / "elites") if isinstance(elite, int) else (elite, folder)
     if not elite_names(folder):
         raise UserError(f"{folder} has no elites yet: finish the run first, by the command that began it")
-    arrays, record = read_elite(folder / "elites", name)
+    arrays, record = read_elite(place, name)
     tube = Tube.of(arrays, record)
     measured = read_measured(file, arrays["x"].shape[1])
     _check_time(file, measured, float(tube.elite.time[-1]))
@@ -89,7 +90,7 @@ def replay_run(folder: Path, file: Path, elite: int, console: Console) -> bool:
         results.mkdir(exist_ok=True)
     replace(results / f"{file.stem}.csv", _table(replay).encode())
     replace_json(results / f"{file.stem}.json", {"file": str(file), **replay.told()})
-    _draw(config, Shown.of(f"elite {name}", VERMILION, arrays, record), replay, results, file.stem)
+    _draw(config, Shown.of(f"funnel of {name}", VERMILION, arrays, record), replay, results, file.stem)
     for line in [*jumps(measured, list(config.plant.states.values())), *_summary(replay)]:
         console.message(line)
     console.message(f"V/rho of every sample, and its figure: {results / file.stem}.csv, .json, .png, .pdf")
@@ -106,7 +107,7 @@ def _check_time(file: Path, measured: Measured, end: float) -> None:
 
 def _summary(replay: Replay) -> list[str]:
     told, time = replay.told(), replay.measured.time
-    whose = f"elite {told['elite']} ({told['rung']})"
+    whose = f"the funnel of {told['elite']} ({told['rung']})"
     lines = [f"{told['samples']} samples, t = {time[0]:.4g} to {time[-1]:.4g} s, {whose}"]
     if replay.kept:
         lines.append(f"inside the funnel all the way; smallest margin 1 - V/rho = {told['smallest_margin']:.3g}")

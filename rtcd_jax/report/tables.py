@@ -5,6 +5,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, final
 
+from rtcd_jax.report.history import POLICY
 from rtcd_jax.report.reading import Experiment, Run
 from rtcd_jax.report.words import VOLUMES, duration, ratio, volume_unit, words
 
@@ -37,18 +38,20 @@ def comparison(runs: Sequence[Run]) -> Table:
     plant = runs[0].config.plant
     heads = (
         "run", "searched", *(f"{words(name)} [{unit}]" for name, unit in plant.design.items()),
-        *_weight_heads(runs[0]), *map(words, VOLUMES), "sum × initial", "rung", "sum shown", "rung shown", "promise",
+        *_weight_heads(runs[0]), *(POLICY[name] for name in _searched_options(runs)), *map(words, VOLUMES),
+        "sum × initial", "rung", "sum shown", "rung shown", "promise",
         "time",
     )  # fmt: skip
-    return Table(heads, tuple(_compared(run) for run in runs))
+    return Table(heads, tuple(_compared(run, _searched_options(runs)) for run in runs))
 
 
 def elites(run: Run) -> Table:
     """The archive, best first."""
-    plant = run.config.plant
+    plant, options = run.config.plant, _searched_options([run])
     shown = {name: (found["found"]["sum"], found["rung"]) for name, found in run.certificates.items() if found}
     heads = (
         "elite", *(f"{words(name)} [{unit}]" for name, unit in plant.design.items()), *_weight_heads(run),
+        *(POLICY[name] for name in options),
         *(f"{words(name)} [{volume_unit(run.config, name)}]" for name in VOLUMES), "sum × initial",
         "largest knot [%]", "swing-up [s]", "ε", "rung", *(["sum shown", "rung shown"] if shown else []),
     )  # fmt: skip
@@ -58,7 +61,8 @@ def elites(run: Run) -> Table:
         volumes = record["volumes"]
         weights = (*record["weights"]["q"], *record["weights"]["r"])
         told = (
-            name, *record["design"].values(), *weights, *(volumes[key] for key in VOLUMES),
+            name, *record["design"].values(), *weights, *(record["policy"][name] for name in options),
+            *(volumes[key] for key in VOLUMES),
             ratio(volumes["sum"], before), 100 * volumes["share_of_largest_knot"], record["duration"],
             record["epsilon"], record["rung"],
         )  # fmt: skip
@@ -139,14 +143,15 @@ def _gains_of(run: Run) -> Iterator[tuple[Cell, ...]]:
             yield words(name), unit, None, found["found"][name], None, took, found["rung"]
 
 
-def _compared(run: Run) -> tuple[Cell, ...]:
+def _compared(run: Run, options: Sequence[str]) -> tuple[Cell, ...]:
     record, config = run.best.record, run.config
     found = run.certificates.get("000")
     before = run.initial.volumes["sum"] if run.initial else None
     kept = [seen.get("kept") for seen in run.verification.values()]
     return (
         run.name, f"{words(config.search.objective)}, {config.search.mode}", *record["design"].values(),
-        *record["weights"]["q"], *record["weights"]["r"], *(run.best.volumes[name] for name in VOLUMES),
+        *record["weights"]["q"], *record["weights"]["r"], *(record["policy"][name] for name in options),
+        *(run.best.volumes[name] for name in VOLUMES),
         ratio(run.best.volumes["sum"], before) if before is not None else None, record["rung"],
         *((found["found"]["sum"], found["rung"]) if found else (None, None)),
         ("kept" if all(kept) else "BROKEN") if kept else None, told_time(run),
@@ -178,6 +183,11 @@ def _origin(run: Run) -> Iterator[tuple[Cell, ...]]:
         yield f"start {number}", f"{start.get('time')}{spent}, commit {start.get('commit')}, {where}"
         versions = ", ".join(f"{name} {version}" for name, version in start.get("versions", {}).items())
         yield f"versions {number}", versions
+
+
+def _searched_options(runs: Sequence[Run]) -> list[str]:
+    """The policy's options that any of the runs searched."""
+    return [name for name in POLICY if any(name in run.config.policy.variables() for run in runs)]
 
 
 def _weight_heads(run: Run) -> list[str]:

@@ -85,13 +85,17 @@ class Elite:
     ) -> tuple[Int[np.ndarray, " states"], Float[np.ndarray, "states n"]]:
         """Knots, ascending and as even as `states` allows, and uniform states of their ellipsoids."""
         knots = np.sort(np.arange(states) % self.time.size)
+        return knots, self.points(knots, random)
+
+    def points(self, knots: Int[np.ndarray, " states"], random: np.random.Generator) -> Float[np.ndarray, "states n"]:
+        """A uniform state of each of the `knots`' ellipsoids."""
         n = self.x_goal.size
-        direction = random.normal(size=(states, n))
-        radius = random.uniform(size=(states, 1)) ** (1 / n)
+        direction = random.normal(size=(len(knots), n))
+        radius = random.uniform(size=(len(knots), 1)) ** (1 / n)
         ball = radius * direction / np.linalg.norm(direction, axis=1, keepdims=True)
         # S = L L' makes V = |L' (x - x_k)|^2, so that x - x_k = sqrt(rho) L^-T y with |y| <= 1
         axes = np.sqrt(self.rho)[:, None, None] * np.linalg.inv(np.linalg.cholesky(self.S))
-        return knots, self.x[knots] + np.einsum("sji,sj->si", axes[knots], ball)
+        return self.x[knots] + np.einsum("sji,sj->si", axes[knots], ball)
 
 
 def _quadratic(weight: np.ndarray, error: np.ndarray) -> np.ndarray:

@@ -30,6 +30,9 @@ FORGOTTEN = 0.1
 SETTLING = 15.0
 """Settling time in time constants of the slowest mode about the goal."""
 
+SETTLING_INTERVALS = 4
+"""Intervals between two looks at who has settled."""
+
 Dynamics = Callable[[np.ndarray, np.ndarray], np.ndarray]
 """x [states n], u [states m] -> x' [states n]."""
 Policy = Callable[[float, np.ndarray], np.ndarray]
@@ -56,17 +59,23 @@ class Outcome:
 
 
 def simulate(
-    elite: Elite, f: Dynamics, march: March, knots: Int[np.ndarray, " states"], states: Float[np.ndarray, "states n"]
+    elite: Elite,
+    f: Dynamics,
+    march: March,
+    knots: Int[np.ndarray, " states"],
+    states: Float[np.ndarray, "states n"],
+    settle: March | None = None,
 ) -> Outcome:
-    """Follows every state from its knot's time to the last knot and then for the settling time.
+    """Follows every state from its knot's time to the last knot by `march`, then for the settling time by `settle`, or
+    by `march`, too.
 
-    `f` are the dynamics that `march` integrates; here they give the slopes of x*(t) and the settling time.
+    `f` are the dynamics that both integrate; here they give the slopes of x*(t) and the settling time.
     """
     x = states.copy()
     left_funnel = np.zeros(len(x), bool)
     left_limits = _outside(elite, x)
 
-    def advance(moving: np.ndarray, policy: Policy, start: float, end: float) -> None:
+    def advance(march: March, moving: np.ndarray, policy: Policy, start: float, end: float) -> None:
         if not moving.size:
             return
         outside = np.zeros(moving.size, bool)
@@ -77,15 +86,15 @@ def simulate(
 
     for k in range(len(elite.u)):
         moving = np.flatnonzero((knots <= k) & ~left_limits)
-        advance(moving, tracking(elite, f, k), elite.time[k], elite.time[k + 1])
+        advance(march, moving, tracking(elite, f, k), elite.time[k], elite.time[k + 1])
         level = elite.rho[k + 1] * (1 + LEVEL_TOLERANCE)
         left_funnel[moving] |= ~(elite.value(k + 1, x[moving]) <= level)
 
     arrived = ARRIVED * elite.rho[-1]
-    interval = elite.time[-1] - elite.time[-2]
+    interval = SETTLING_INTERVALS * (elite.time[-1] - elite.time[-2])
     for _ in range(math.ceil(settling_time(elite, f) / interval)):
         moving = np.flatnonzero(~left_limits & ~(elite.value_of_goal(x) <= FORGOTTEN * arrived))
-        advance(moving, holding(elite), 0.0, interval)
+        advance(settle or march, moving, holding(elite), 0.0, interval)
     return Outcome(left_funnel, left_limits, left_limits | ~(elite.value_of_goal(x) <= arrived))
 
 
@@ -129,8 +138,12 @@ def settling_time(elite: Elite, f: Dynamics) -> float:
 def fastest_rate(elite: Elite, f: Dynamics) -> float:
     """Largest |eigenvalue| of the unsaturated loop at the knots and the goal [1/s]."""
     tracked = zip(elite.x[:-1], elite.u, elite.K[:-1], strict=True)
-    points = [*tracked, (elite.x_goal, np.zeros_like(elite.u_max), elite.K_goal)]
-    return max(float(np.abs(_modes(f, *point)).max()) for point in points)
+    return max(fastest_rate_of_goal(elite, f), *(float(np.abs(_modes(f, *point)).max()) for point in tracked))
+
+
+def fastest_rate_of_goal(elite: Elite, f: Dynamics) -> float:
+    """Largest |eigenvalue| of the goal's unsaturated loop [1/s]."""
+    return float(np.abs(_modes(f, elite.x_goal, np.zeros_like(elite.u_max), elite.K_goal)).max())
 
 
 def runge_kutta(f: Dynamics, longest_step: float) -> March:

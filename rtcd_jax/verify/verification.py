@@ -126,7 +126,7 @@ class Trial:
         """
         knots, x = (drawn[chunk :: self.chunks] for drawn in self.sample())
         seen = witness(self.elite, name, len(x))
-        return simulate(self.elite, seen.dynamics, seen.march, knots, x)
+        return simulate(self.elite, seen.dynamics, seen.march, knots, x, seen.settle)
 
     def verification(self, outcomes: Mapping[tuple[str, int], Outcome]) -> Verification:
         """All chunks' outcomes, by witness and chunk, put together."""

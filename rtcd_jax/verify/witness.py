@@ -6,7 +6,7 @@ from typing import NamedTuple, final
 import numpy as np
 
 from rtcd_jax.verify.elite import Elite
-from rtcd_jax.verify.simulate import Dynamics, March, dormand_prince, fastest_rate, runge_kutta
+from rtcd_jax.verify.simulate import Dynamics, March, dormand_prince, fastest_rate, fastest_rate_of_goal, runge_kutta
 
 STEPS = 4
 """Fixed steps in an interval, at least."""
@@ -18,11 +18,12 @@ RELATIVE, ABSOLUTE = 1e-8, 1e-9
 
 @final
 class Witness(NamedTuple):
-    """Someone who simulates a plant."""
+    """Someone who simulates a plant: `march` along the trajectory, `settle` at the goal."""
 
     name: str
     dynamics: Dynamics
     march: March
+    settle: March
 
 
 def witnesses(elite: Elite, states: int) -> Iterator[Witness]:
@@ -37,11 +38,12 @@ def witnesses(elite: Elite, states: int) -> Iterator[Witness]:
     columns = elite.x_goal.size + elite.u_max.size
     mujoco = CpuDynamics(model_of(elite.plant, elite.parameters), max(states, 2 * columns))
     step = min(interval / STEPS, STEP_OF_FASTEST / fastest_rate(elite, mujoco))
-    yield Witness("C MuJoCo", mujoco, runge_kutta(mujoco, step))
+    slow_step = STEP_OF_FASTEST / fastest_rate_of_goal(elite, mujoco)
+    yield Witness("C MuJoCo", mujoco, runge_kutta(mujoco, step), runge_kutta(mujoco, slow_step))
     if elite.plant in CLOSED_FORMS:
         closed_form = CLOSED_FORMS[elite.plant](elite.parameters)
         march = dormand_prince(closed_form, interval / 4, RELATIVE, ABSOLUTE)
-        yield Witness("closed form", closed_form, march)
+        yield Witness("closed form", closed_form, march, march)
 
 
 def witness(elite: Elite, name: str, states: int) -> Witness:

@@ -69,6 +69,11 @@ def test_parameters_name_the_robot_completely(robot):
             type(robot.plant).from_parameters({k: v for k, v in parameters.items() if k != name})
 
 
+def test_every_parameter_has_its_unit_and_every_state_and_input_its_sign(robot):
+    assert robot.plant.parameter_units.keys() == robot.plant.parameters(robot.design(0)).keys()
+    assert all(name in robot.plant.convention for name in (*robot.plant.state_names, *robot.plant.input_names))
+
+
 def test_every_design_variable_moves_the_robot(robot):
     def acceleration(design):
         return jnp.sum(robot.plant.dynamics(design, robot.x[0], robot.u[0]) ** 2)

@@ -18,6 +18,9 @@ weights:
   q: [{initial: 10, min: 1, max: 20}, {initial: 10, min: 1, max: 20}, {initial: 1, min: 1, max: 1}, {initial: 1, min: 1, max: 1}]
   r: [{initial: 10, min: 5, max: 15}]
 """  # noqa: E501 (YAML of one variable a line would hide the rest)
+SEARCHED_POLICY = {
+    "authority": {"initial": 0.05, "min": 0.01, "max": 1.0}, "discount": {"initial": 0.5, "min": 0.0, "max": 2.0}
+}  # fmt: skip
 YAMLS = {"pendulum": configuration.EXAMPLE, "cartpole": CARTPOLE}
 CERTIFICATE = {
     "elite": "000", "rung": "proved", "start": 0.0, "intervals": 6, "seconds": 7.25,
@@ -64,6 +67,7 @@ def candidate(config, seed=0, scale=1.0, **changes):
         "status": "OK",
         "design": {name: variable.initial for name, variable in config.design.items()},
         "weights": {letter: [variable.initial for variable in found] for letter, found in config.weights},
+        "policy": config.policy.initial(),
         "rung": "sampled",
         "epsilon": 0.0023,
         "confidence": 0.99,

@@ -60,6 +60,16 @@ def test_a_browser_shows_every_figure_without_error_or_request_or_sideways_scrol
     assert len(set(tab.value(width))) == 1
 
 
+def test_a_page_that_asks_for_something_or_complains_would_be_seen(tmp_path, chromium):
+    path = tmp_path / "bad.html"
+    path.write_text(
+        "<!doctype html><img src='http://127.0.0.1:9/x.png'><script>console.error('no'); missing();</script>"
+    )
+    tab = chromium.open(path, browser.LAPTOP)
+    assert tab.requests() == ["http://127.0.0.1:9/x.png"]
+    assert len(tab.complaints()) >= 2
+
+
 SUMS = """(() => {
   const table = [...document.querySelectorAll("section")].find((s) => s.querySelector("h2").textContent === "Elites");
   const heads = [...table.querySelectorAll("th")];
@@ -136,9 +146,13 @@ def test_one_run_gets_its_page_and_figures_several_get_one_beside_them(tmp_path,
     assert page == first / "report.html"
     assert {path.relative_to(first) for path in drawn} == {
         first.relative_to(first) / "figures" / f"{name}.{kind}"
-        for name in ("funnel", "levels", "courses", "convergence")
+        for name in ("overlay", "funnel", "levels", "courses", "convergence")
         for kind in ("png", "pdf")
     }
+    before = sorted(first.rglob("*"))
+    page, *drawn = report([first], tmp_path / "shared.html")
+    assert {path.parent for path in drawn} == {tmp_path / "shared_figures"}
+    assert sorted(first.rglob("*")) == before
     assert report([first, second])[0] == tmp_path / "comparison.html"
     assert report([first, second], tmp_path / "mine.html") == [
         tmp_path / f"mine.{kind}" for kind in ("html", "png", "pdf")

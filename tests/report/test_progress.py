@@ -9,7 +9,7 @@ from rtcd_jax.report.history import courses, failures, physical, spread
 from rtcd_jax.report.history import searched as searched_variables
 from rtcd_jax.report.progress import draw_convergence, draw_courses
 from rtcd_jax.report.reading import read_run
-from tests.report.runs import candidate, experiment, generation, run_folder
+from tests.report.runs import SEARCHED_POLICY, candidate, experiment, generation, run_folder
 
 
 def searched(tmp_path, generations, plant="pendulum"):
@@ -89,13 +89,13 @@ def test_decoded_values_are_those_of_the_search():
     from rtcd_jax.population import decode
     from rtcd_jax.problem import make_problem
 
-    for plant in ("pendulum", "cartpole"):
-        config = experiment(plant)
+    for config in (experiment("pendulum"), experiment("cartpole", policy=SEARCHED_POLICY)):
         variables = searched_variables(config)
         genome = np.linspace(0.1, 0.9, len(variables))
         candidate = decode(make_problem(config), jnp.asarray(genome))
         design = [getattr(candidate.design, name) for name in config.plant.design]
-        values = dict(zip(config.variables(), [*design, *candidate.q, *candidate.r], strict=True))
+        policy = [getattr(candidate, name) for name in config.policy.variables()]
+        values = dict(zip(config.variables(), [*design, *candidate.q, *candidate.r, *policy], strict=True))
         for share, (name, (variable, _)) in zip(genome, variables.items(), strict=True):
             np.testing.assert_allclose(physical(name, variable, share), float(values[name]))
 

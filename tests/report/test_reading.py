@@ -1,6 +1,7 @@
 """A run folder is read whole, or refused by one line that names what is wrong."""
 
 import json
+from dataclasses import replace
 
 import pytest
 
@@ -37,13 +38,15 @@ def test_the_time_is_that_of_all_starts_or_unknown(tmp_path, spent, seconds):
 
 
 def test_a_funnel_that_runs_share_is_shown_once(tmp_path):
+    """Its levels differ a little from run to run, since every run samples them with its own seed."""
     first, second = (read_run(finished(tmp_path / name)) for name in ("rtc", "rtcd"))
+    second = replace(second, initial=replace(second.initial, rho=1.01 * second.initial.rho))
     assert [funnel.label for funnel in shown(compared([first, second]))] == ["initial", "rtc", "rtcd"]
     config = experiment()
     other = run_folder(tmp_path / "other", config, candidate(config, 5), candidate(config, 1))
     runs = compared([first, read_run(other)])
     assert [funnel.label for funnel in shown(runs)] == ["rtc, initial", "other, initial", "rtc", "other"]
-    assert runs[0].best.color != runs[1].best.color
+    assert len({funnel.color for funnel in shown(runs)}) == 4
 
 
 def test_runs_of_one_name_are_told_by_their_paths(tmp_path):

@@ -10,6 +10,7 @@ from rtcd_jax.errors import UserError
 from rtcd_jax.report.measured import columns_of, jumps, read_measured
 from rtcd_jax.report.replay import replay_run
 from rtcd_jax.report.tube import Tube
+from rtcd_jax.storage import write_elite
 from tests.report.loops import LOOPS, loop_folder, stored
 
 HEADS = {"pendulum": "time,pos,vel,torque", "cartpole": "time,pos1,pos2,vel1,vel2,tau1,tau2"}
@@ -61,6 +62,16 @@ def test_a_motion_inside_all_the_way_is_told_its_smallest_margin(tmp_path, plant
     np.testing.assert_allclose([float(row["V/rho"]) for row in rows], fill)
     assert {row["inside"] for row in rows} == {"1"}
     assert any("inside the funnel all the way" in line for line in said.lines)
+
+
+def test_the_initial_candidate_s_funnel_is_its_own(tmp_path, figures):
+    folder = loop_folder(tmp_path / "run", "pendulum")
+    arrays, record = stored("pendulum")
+    write_elite(folder, "initial", arrays | {"rho": arrays["rho"] / 4}, record)
+    path = measured_file(tmp_path / "lab.csv", "pendulum", *motion("pendulum", lambda t: np.full_like(t, 0.7)))
+    assert replay_run(folder, path, 0, Said())
+    assert not replay_run(folder, path, "initial", Said())
+    assert json.loads((folder / "replay" / "lab.json").read_text())["first_exit"]["V/rho"] == pytest.approx(4 * 0.49)
 
 
 @pytest.mark.parametrize(("peak", "kept"), [(0.999, True), (1.001, False)])

@@ -6,8 +6,17 @@ import math
 import pytest
 
 from rtcd_jax.report import tables
+from rtcd_jax.report.page import render
 from rtcd_jax.report.reading import Experiment, compared, read_run
-from tests.report.runs import CERTIFICATE, candidate, experiment, finished, prove_and_verify, run_folder
+from tests.report.runs import (
+    CERTIFICATE,
+    SEARCHED_POLICY,
+    candidate,
+    experiment,
+    finished,
+    prove_and_verify,
+    run_folder,
+)
 
 
 def rows(table):
@@ -119,3 +128,14 @@ def test_provenance_names_configuration_and_starts(tmp_path):
     assert "commit" in told["start 1"]
     assert "numpy" in told["versions 1"]
     assert told["time"] == "not recorded"
+
+
+def test_searched_options_of_the_policy_stand_beside_the_weights(tmp_path):
+    config = experiment(policy=SEARCHED_POLICY)
+    found = candidate(config, 1, 3.0, policy={"input_weight": 1.0, "authority": 0.2, "discount": 0.75})
+    run = read_run(run_folder(tmp_path / "searched", config, candidate(config), found))
+    assert rows(tables.elites(run))[0]["authority [-]"] == 0.2
+    assert "authority = 0.2, discount = 0.75" in render([run])
+    other = read_run(finished(tmp_path / "fixed"))
+    assert [row["discount [1/s]"] for row in rows(tables.comparison(compared([run, other])))] == [0.75, 0.0]
+    assert "authority [-]" not in rows(tables.elites(other))[0]

@@ -1,0 +1,11 @@
+#!/usr/bin/env bash
+# A run on a workstation, in the background, that outlives the terminal and is started again after a crash of the
+# machine by the same command:
+#   launch/local.sh configs/cartpole_rtcd.yaml --run checkpoints/cartpole_rtcd
+# Its output goes to rtcd.log; `kill -TERM PROCESS` saves and stops it.
+set -euo pipefail
+export JAX_COMPILATION_CACHE_DIR="${JAX_COMPILATION_CACHE_DIR:-$PWD/.jax_cache}"
+export JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS=0
+export JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES=-1
+nohup "${RTCD:-rtcd}" optimize "$@" >>rtcd.log 2>&1 </dev/null &
+echo "process $!, output in rtcd.log"

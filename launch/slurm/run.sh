@@ -1,0 +1,33 @@
+#!/usr/bin/env bash
+# `rtcd` under srun, requeued when it was asked to stop: the last line of every script in this folder.
+#
+#   launch/slurm/run.sh optimize configs/pendulum_rtcd.yaml --run checkpoints/pendulum_rtcd
+#
+# On preemption, or shortly before the time limit (#SBATCH --signal=TERM@120), Slurm sends SIGTERM: rtcd saves and exits
+# with 85. With 75 it has lost one of its processes (a node failed). Both times the job goes back into the queue, and the
+# same command goes on where the state was saved. A cancelled job does not come back.
+set -uo pipefail
+
+trap : TERM   # this shell must outlive the signal, to requeue
+
+# Programs are compiled once, not at every start. The folder must be on a file system that all nodes share.
+export JAX_COMPILATION_CACHE_DIR="${JAX_COMPILATION_CACHE_DIR:-$PWD/.jax_cache}"
+export JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS=0
+export JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES=-1
+
+srun --kill-on-bad-exit=0 "${RTCD:-rtcd}" "$@"
+code=$?
+
+restarts=${SLURM_RESTART_COUNT:-0}
+if [[ $code == 85 || $code == 75 ]]; then
+  if ((restarts >= ${RTCD_RESTARTS:-100})); then
+    echo "restarted $restarts times: not requeued"
+  elif ! command -v scontrol >/dev/null; then
+    echo "scontrol is not here (a container?): requeue by hand, scontrol requeue $SLURM_JOB_ID"
+  else
+    # Job arrays are requeued task by task.
+    job=${SLURM_ARRAY_JOB_ID:+${SLURM_ARRAY_JOB_ID}_$SLURM_ARRAY_TASK_ID}
+    scontrol requeue "${job:-$SLURM_JOB_ID}"
+  fi
+fi
+exit $code

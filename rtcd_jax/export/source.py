@@ -1,0 +1,112 @@
+"""The C controller's numbers as headers, and the text of the folder's README."""
+
+from collections.abc import Iterator
+from importlib.resources import files
+from string import Template
+from typing import Any
+
+import numpy as np
+
+from rtcd_jax.export.bundle import Bundle
+
+TEMPLATES = files("rtcd_jax.export") / "templates"
+COPIED = ("controller.py", "controller.h", "controller.c", "controller_test.c")
+"""Templates that are the same for every robot."""
+
+
+def template(name: str) -> str:
+    """A file of the folder `templates`."""
+    return (TEMPLATES / name).read_text(encoding="utf-8")
+
+
+def size_header(bundle: Bundle) -> str:
+    """`controller_size.h`: how many states, inputs and intervals there are, and the inputs' limits."""
+    elite = bundle.elite
+    return _header(
+        bundle,
+        "RTCD_CONTROLLER_SIZE_H",
+        [
+            f"#define RTCD_STATES {elite.x_goal.size}",
+            f"#define RTCD_INPUTS {elite.u_max.size}",
+            f"#define RTCD_INTERVALS {len(elite.u)}",
+            f"#define RTCD_INPUT_LIMITS {_initializer(elite.u_max)}",
+        ],
+    )
+
+
+def data_header(bundle: Bundle) -> str:
+    """`controller_data.h`: every number that the controller and the monitor look up."""
+    elite = bundle.elite
+    arrays = {
+        "X": elite.x,
+        "X_RATES": bundle.tube.rates,
+        "U": elite.u,
+        "K": elite.K,
+        "S": elite.S,
+        "S_RATES": bundle.tube.slopes,
+        "LOG_RHO": np.log(elite.rho),
+        "K_GOAL": elite.K_goal,
+        "X_GOAL": elite.x_goal,
+        "U_MAX": elite.u_max,
+        "STATE_LIMITS": elite.state_limits,
+    }
+    scalars = [f"#define RTCD_DT {_number(elite.time[1])}", f"#define RTCD_DURATION {_number(elite.time[-1])}"]
+    return _header(bundle, "RTCD_CONTROLLER_DATA_H", [*scalars, *_definitions(arrays)])
+
+
+def readme(bundle: Bundle, described: dict[str, Any]) -> str:
+    """The folder's README: what lies where, which way the axes point, what is promised."""
+    funnel, certificate = described["funnel"], described["certificate"]
+    proof = (
+        f"`certificate.json` is its certificate (rung {certificate['rung'] or 'unknown'}); `rtcd check` checks it."
+        if certificate
+        else "It has no certificate."
+    )
+    quantities = [*described["states"], *described["inputs"]]
+    rows = [f"| {item['name']} | {item['unit']} | {_limit(item['limit'])} |" for item in quantities]
+    design = ", ".join(
+        f"{name} {value:.6g} {bundle.plant.design_units[name]}" for name, value in described["design"].items()
+    )
+    return Template(template("README.md")).substitute(
+        plant=described["plant"],
+        elite=bundle.name,
+        config=described["config_hash"],
+        design=design,
+        convention=bundle.plant.convention,
+        quantities="\n".join(rows),
+        duration=f"{bundle.elite.time[-1]:.6g}",
+        rate=f"{described['control_rate']['least']:g}",
+        rung=funnel["rung"],
+        epsilon=f"{funnel['epsilon']:.2g}",
+        confidence=f"{funnel['confidence']:g}",
+        inlet=f"{funnel['volumes']['inlet']:.4g} {funnel['volume_unit']}",
+        proof=proof,
+        columns="`time,pos,vel,torque`" if bundle.elite.x_goal.size == 2 else "`time,pos1,…,vel1,…,tau1,…,K11,…`",
+    )
+
+
+def _header(bundle: Bundle, guard: str, lines: list[str]) -> str:
+    source = (
+        f"/* {bundle.elite.plant}, elite {bundle.name}, configuration {bundle.record['config_hash']}. Generated. */"
+    )
+    return "\n".join([source, f"#ifndef {guard}", f"#define {guard}", "", *lines, "", "#endif", ""])
+
+
+def _definitions(arrays: dict[str, np.ndarray]) -> Iterator[str]:
+    for name, array in arrays.items():
+        sizes = "".join(f"[{size}]" for size in array.shape)
+        yield f"static const double RTCD_{name}{sizes} = {_initializer(array)};"
+
+
+def _initializer(array: np.ndarray) -> str:
+    if array.ndim == 1:
+        return "{" + ", ".join(map(_number, array.tolist())) + "}"
+    return "{" + ",\n    ".join(map(_initializer, array)) + "}"
+
+
+def _number(value: float) -> str:
+    return repr(float(value)) if np.isfinite(value) else "HUGE_VAL"
+
+
+def _limit(limit: float) -> str:
+    return f"± {limit:.6g}" if np.isfinite(limit) else "none"

@@ -1,0 +1,1 @@
+"""Scaling studies: what a generation costs against the population and the devices, measured point by point."""

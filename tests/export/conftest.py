@@ -1,0 +1,49 @@
+"""One export of every robot, shared by the tests that look at parts of it."""
+
+import importlib.util
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import pytest
+
+from rtcd_jax.export import export_run
+from rtcd_jax.export.bundle import Bundle, read_bundle
+from tests.export.folders import ELITES, run_folder
+
+
+class Silent:
+    """A console that remembers."""
+
+    def __init__(self):
+        self.lines = []
+
+    def message(self, text):
+        self.lines.append(text)
+
+
+class Export(NamedTuple):
+    """A folder that was exported, what it was exported from, and its own controller module."""
+
+    run: Path
+    folder: Path
+    bundle: Bundle
+    module: Any
+
+
+@pytest.fixture(scope="session", params=list(ELITES))
+def export(request, tmp_path_factory):
+    """The export of one robot's elite 000."""
+    path = tmp_path_factory.mktemp(request.param)
+    run, folder = run_folder(path / "run", request.param), path / "lab"
+    export_run(run, 0, folder, Silent())
+    return Export(run, folder, read_bundle(run, "000"), _module(folder / "controller.py"))
+
+
+def _module(path):
+    """The exported file itself, not the template that it was copied from."""
+    spec = importlib.util.spec_from_file_location(f"exported_{path.parent.parent.name}", path)
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module

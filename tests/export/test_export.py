@@ -1,0 +1,206 @@
+"""An export is whole, says what it is, replaces nothing but a former one, and refuses with one clear line."""
+
+import csv
+import hashlib
+import json
+
+import numpy as np
+import pytest
+import yaml
+
+from rtcd_jax.errors import UserError
+from rtcd_jax.export import export_run
+from rtcd_jax.export.bundle import read_bundle
+from rtcd_jax.storage import read_elite
+from tests.certificate import swing
+from tests.export.conftest import Silent
+from tests.export.folders import run_folder
+
+
+@pytest.fixture
+def run(tmp_path):
+    """A pendulum's run folder."""
+    return run_folder(tmp_path / "run", "pendulum")
+
+
+def table(path):
+    """The header and the numbers of a CSV file."""
+    with path.open() as file:
+        header, *rows = csv.reader(file)
+    return header, np.array(rows, float)
+
+
+def test_the_trajectory_has_the_columns_of_the_toolkits(export):
+    arrays, _ = read_elite(export.run / "elites", "000")
+    header, rows = table(export.folder / "trajectory.csv")
+    u = np.append(arrays["u"][:, 0], 0)
+    if export.bundle.elite.plant == "pendulum":
+        assert header == ["time", "pos", "vel", "torque"]
+        np.testing.assert_array_equal(rows, np.column_stack([arrays["time"], arrays["x"], u]))
+        return
+    assert header[:7] == ["time", "pos1", "pos2", "vel1", "vel2", "tau1", "tau2"]
+    assert header[7:] == ["K11", "K12", "K13", "K14", "K21", "K22", "K23", "K24"]
+    np.testing.assert_array_equal(rows[:, :7], np.column_stack([arrays["time"], arrays["x"], u, 0 * u]))
+    np.testing.assert_array_equal(rows[:, 7:11], arrays["K"][:, 0])
+    np.testing.assert_array_equal(rows[:, 11:], 0)
+
+
+def test_the_tables_read_back_to_the_elites_own_numbers(export):
+    arrays, _ = read_elite(export.run / "elites", "000")
+    header, rows = table(export.folder / "gains.csv")
+    assert header[:2] == ["time", "K11"]
+    np.testing.assert_array_equal(rows[:, 1:], arrays["K"].reshape(len(rows), -1))
+    header, rows = table(export.folder / "funnel.csv")
+    assert header[:4] == ["time", "rho", "volume_sampled", "S11"]
+    np.testing.assert_array_equal(rows[:, 1:3], np.column_stack([arrays["rho"], arrays["volumes_per_knot"]]))
+    n = arrays["S"].shape[1]
+    for name, column in zip(header[3:], rows[:, 3:].T, strict=True):
+        i, j = int(name[1]) - 1, int(name[2]) - 1
+        assert i <= j < n
+        np.testing.assert_array_equal(column, arrays["S"][:, i, j])
+
+
+def test_the_bundle_says_what_its_numbers_mean(export):
+    told = json.loads((export.folder / "controller.json").read_text())
+    elite = export.bundle.elite
+    assert [state["name"] for state in told["states"]] == list(export.bundle.plant.state_names)
+    limits = [None if state["limit"] is None else state["limit"] for state in told["states"]]
+    assert limits == [limit if np.isfinite(limit) else None for limit in elite.state_limits.tolist()]
+    assert told["inputs"][0]["limit"] == elite.u_max[0]
+    assert "upright" in told["convention"]
+    assert told["funnel"]["rung"] == "sampled"
+    assert (told["funnel"]["epsilon"], told["funnel"]["confidence"]) == (0.01, 0.99)
+    assert told["config_hash"] == "0123456789ab"
+    assert told["certificate"] is None
+    parameters = yaml.safe_load((export.folder / "parameters.yaml").read_text())["parameters"]
+    assert {name: entry["value"] for name, entry in parameters.items()} == dict(elite.parameters)
+    assert all(entry["unit"] for entry in parameters.values())
+
+
+def test_the_least_rate_holds_the_input_for_a_tenth_of_the_fastest_time_constant(run):
+    """The eigenvalues of A - B K at knots and goal, by the equations that the elite was made with."""
+    bundle = read_bundle(run, "000")
+    elite = bundle.elite
+    fastest = max(
+        np.abs(np.linalg.eigvals(np.subtract(*_linear(x, gain)))).max()
+        for x, gain in zip(elite.x, elite.K, strict=True)
+    )
+    rate = bundle.describe()["control_rate"]["least"]
+    assert rate % 50 == 0
+    assert rate - 50 < 10 * fastest <= rate
+
+
+def _linear(x, gain):
+    a, b = swing.linear(x)
+    return a, b @ gain
+
+
+def test_the_mark_has_the_digest_of_every_file(export):
+    mark = json.loads((export.folder / "export.json").read_text())
+    assert mark["complete"] is True
+    there = {path.name for path in export.folder.iterdir() if path.is_file()} - {"export.json"}
+    assert there == mark["files"].keys()
+    for name, digest in mark["files"].items():
+        assert hashlib.sha256((export.folder / name).read_bytes()).hexdigest() == digest
+
+
+def test_exports_of_the_same_elite_are_equal_bit_by_bit(export, tmp_path):
+    console = Silent()
+    export_run(export.run, 0, tmp_path / "again", console)
+    for path in export.folder.iterdir():
+        if path.is_file():
+            assert (tmp_path / "again" / path.name).read_bytes() == path.read_bytes()
+    assert "is in" in console.lines[0]
+
+
+def test_a_former_export_is_replaced_and_its_stale_files_go(run, tmp_path):
+    target = tmp_path / "lab"
+    export_run(run, 0, target, Silent())
+    mark = json.loads((target / "export.json").read_text())
+    (target / "certificate.json").write_text("old")
+    (target / "notes.txt").write_text("mine")
+    (target / "export.json").write_text(json.dumps(mark | {"files": mark["files"] | {"certificate.json": "0"}}))
+    (target / "gains.csv").write_text("old")
+    console = Silent()
+    export_run(run, "initial", target, console)
+    assert "elite initial" in console.lines[0]
+    assert "replaces the former export" in console.lines[0]
+    assert not (target / "certificate.json").exists()
+    assert (target / "notes.txt").read_text() == "mine"
+    assert (target / "gains.csv").read_text() != "old"
+
+
+def test_an_export_that_a_kill_has_left_half_done_says_so_and_is_taken_up(run, tmp_path, monkeypatch):
+    target = tmp_path / "lab"
+
+    def killed(path, content):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr("rtcd_jax.export.replace", killed)
+        with pytest.raises(KeyboardInterrupt):
+            export_run(run, 0, target, Silent())
+    assert json.loads((target / "export.json").read_text())["complete"] is False
+    export_run(run, 0, target, Silent())
+    assert json.loads((target / "export.json").read_text())["complete"] is True
+
+
+def test_a_folder_of_something_else_is_left_alone(run, tmp_path):
+    target = tmp_path / "mine"
+    target.mkdir()
+    (target / "thesis.tex").write_text("all")
+    with pytest.raises(UserError, match=r"mine is not empty and no former export: it has thesis.tex"):
+        export_run(run, 0, target, Silent())
+    (target / "export.json").write_text('{"format": "another"}')
+    with pytest.raises(UserError, match=r"not empty and no former export: it has export.json, thesis.tex"):
+        export_run(run, 0, target, Silent())
+    with pytest.raises(UserError, match=r"thesis.tex is a file: an export needs a folder"):
+        export_run(run, 0, target / "thesis.tex", Silent())
+    assert sorted(path.name for path in target.iterdir()) == ["export.json", "thesis.tex"]
+
+
+def test_an_elite_that_is_not_there_is_answered_with_those_that_are(run, tmp_path):
+    with pytest.raises(UserError, match=r"has no elite 007; there are 000$"):
+        export_run(run, 7, tmp_path / "lab", Silent())
+    with pytest.raises(UserError, match=r"has no elite 000; there are none yet: finish the run first"):
+        export_run(tmp_path, 0, tmp_path / "lab", Silent())
+    assert not (tmp_path / "lab").exists()
+
+
+def test_a_candidate_without_a_funnel_is_not_exported(tmp_path):
+    run = run_folder(tmp_path / "run", "pendulum", status="FUNNEL_EMPTY")
+    with pytest.raises(UserError, match=r"initial has no funnel to export \(FUNNEL_EMPTY\)"):
+        export_run(run, "initial", tmp_path / "lab", Silent())
+
+
+def hexadecimal(array):
+    return [value.hex() for value in np.ravel(array).tolist()]
+
+
+@pytest.mark.parametrize("same", [True, False])
+def test_a_certificate_goes_along_if_it_is_of_this_controller(run, tmp_path, same):
+    arrays, _ = read_elite(run / "elites", "000")
+    claim = {key: hexadecimal(arrays[key]) for key in ("x", "u", "K", "K_goal")}
+    if not same:
+        claim["K"] = hexadecimal(1.5 * arrays["K"])
+    (run / "certificates").mkdir()
+    (run / "certificates" / "000.json").write_text(json.dumps({"claim": claim}))
+    (run / "certificates" / "summary.json").write_text('{"000": {"rung": "proved", "start": 0.0}}')
+    console = Silent()
+    export_run(run, 0, tmp_path / "lab", console)
+    told = json.loads((tmp_path / "lab" / "controller.json").read_text())["certificate"]
+    assert (tmp_path / "lab" / "certificate.json").is_file() == same
+    assert (told is not None) == same
+    if same:
+        assert (told["rung"], told["from"]) == ("proved", 0.0)
+        assert "rung proved" in console.lines[1]
+        assert "rung proved" in (tmp_path / "lab" / "README.md").read_text()
+    else:
+        assert "certificate: none" in console.lines[1]
+
+
+def test_a_damaged_certificate_is_named(run, tmp_path):
+    (run / "certificates").mkdir()
+    (run / "certificates" / "000.json").write_text("{")
+    with pytest.raises(UserError, match=r"cannot read .*000.json.*prove it again by `rtcd certify"):
+        export_run(run, 0, tmp_path / "lab", Silent())
