@@ -169,12 +169,15 @@ class Descent:
         return self.plan is not None and (k + 1, end) == (self.plan.until, 1.0)
 
     def _held(self, k: int, end: float, front: Front) -> tuple[float, np.ndarray]:
-        """The level of TVLQR's level set inside the front's ellipsoid, and the rotation of y between the two."""
+        """The level of TVLQR's level set inside the front's ellipsoid b, and the rotation of its y.
+
+        With a the level set's own L, a^-1 b = rotation times a symmetric P >= 1: turned, a grows into b all around.
+        """
         if self.plan is None:
             return front.rho, np.eye(self.claim.n)
         b = _floats(front.axes)
         held = flow.held_level(self.loop.value(k, end)[0], b) if self._joins_free(k, end) else front.rho
-        left, _, right = np.linalg.svd(self.loop.axes(k, end, held, 0.0)[0].T @ b)
+        left, _, right = np.linalg.svd(np.linalg.solve(self.loop.axes(k, end, held, 0.0)[0], b))
         return held, left @ right
 
     def _stretch(self, k: int, start: float, end: float, front: Front, first: Pair, last: Pair) -> Stretch:
