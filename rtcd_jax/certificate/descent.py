@@ -75,12 +75,16 @@ def on_grid(matrix: np.ndarray) -> list[list]:
     return [[Q(int(c), 1 << GRID) for c in row] for row in np.rint(matrix * 2.0**GRID)]
 
 
+def _floats(axes: list[list]) -> np.ndarray:
+    return np.array([[float(c) for c in row] for row in axes])
+
+
 @final
 class Descent:
     """The search for one elite's funnel. `exact` asks the checker after every interval (rung *proved*)."""
 
-    def __init__(self, claim: Claim, loop: Loop, exact: bool, aim: flow.Aim | None = None):
-        self.claim, self.loop, self.exact, self.aim = claim, loop, exact, aim
+    def __init__(self, claim: Claim, loop: Loop, exact: bool, plan: flow.Plan | None = None):
+        self.claim, self.loop, self.exact, self.plan = claim, loop, exact, plan
         self._directions = directions(claim.n)
 
     def outlet(self, rho: float) -> Front:
@@ -90,8 +94,8 @@ class Descent:
 
     def down_from(self, front: Front) -> Iterator[Proved]:
         """The intervals from the front back to t = 0, or to where nothing can be proved."""
-        parts = [(0.0, 1.0)] if self.aim is None else flow.shares(self.loop)
-        waiting = [(k, *part) for k in range(front.knot) for part in parts]
+        waiting = [(k, *part) for k in range(front.knot) for part in self._parts(k)]
+        parts = self._parts(front.knot) if front.share > 0 else []
         waiting += [(front.knot, start, min(end, front.share)) for start, end in parts if start < front.share]
         while waiting:
             k, start, end = waiting.pop()
@@ -106,6 +110,13 @@ class Descent:
             spare, proved = found
             front = Front(k, start, proved.rho, proved.piece.first, self.next_trial(spare, proved.margin))
             yield proved
+
+    def _parts(self, k: int) -> list[tuple[float, float]]:
+        return flow.shares(self.loop) if self._is_free(k) else [(0.0, 1.0)]
+
+    def _is_free(self, k: int) -> bool:
+        """Whether the ellipsoids of an interval have a free shape."""
+        return self.plan is not None and k >= self.plan.until
 
     def next_trial(self, place: int, margin: float) -> int:
         """The place of the spare rate that the next interval begins with: a lower one if the margin allows it."""
@@ -124,7 +135,7 @@ class Descent:
 
     def _attempt(self, k: int, start: float, end: float, front: Front, spare: float) -> Proved | None:
         try:
-            shape = self._piece if self.aim is None else self._fastest_piece
+            shape = self._fastest_piece if self._is_free(k) else self._piece
             piece, rho = shape(k, start, end, front, spare)
             check.insist_bounds(self.claim, check.motion(self.claim, piece), "limits")
             piece, todo, degree = self._models(piece, spare)
@@ -138,14 +149,36 @@ class Descent:
     def _piece(self, k: int, start: float, end: float, front: Front, spare: float) -> tuple[Stretch, float]:
         """The interval's ellipsoids, from the front's level and the spare rate; Refused if the level vanishes."""
         loop, duration = self.loop, (end - start) * self.loop.dt
-        rho, last = self._level(k, start, end, front.rho, spare)
+        held, turn = self._held(k, end, front)
+        rho, last = self._level(k, start, end, held, spare)
         first_growth, last_growth = self._growth(k, start, rho, spare), last
         cap = BOX_SHARE * loop.box_level(k, start)
         if rho > cap:
             rho = cap
-            first_growth = last_growth = float(np.log(front.rho / rho) / duration)
-        first = loop.axes(k, start, rho, first_growth)
-        return self._stretch(k, start, end, front, first, loop.axes(k, end, front.rho, last_growth)), rho
+            first_growth = last_growth = float(np.log(held / rho) / duration)
+        (a, a_rate), (b, b_rate) = loop.axes(k, start, rho, first_growth), loop.axes(k, end, held, last_growth)
+        if self._joins_free(k, end):
+            b, turned = _floats(front.axes), a @ turn
+            return self._stretch(
+                k, start, end, front, (turned, (b - turned) / duration), (b, (b - turned) / duration)
+            ), rho
+        return self._stretch(k, start, end, front, (a @ turn, a_rate @ turn), (b @ turn, b_rate @ turn)), rho
+
+    def _joins_free(self, k: int, end: float) -> bool:
+        """Whether an interval of TVLQR's level sets ends with an ellipsoid of free shape."""
+        return self.plan is not None and (k + 1, end) == (self.plan.until, 1.0)
+
+    def _held(self, k: int, end: float, front: Front) -> tuple[float, np.ndarray]:
+        """The level of TVLQR's level set inside the front's ellipsoid b, and the rotation of its y.
+
+        With a the level set's own L, a^-1 b = rotation times a symmetric P >= 1: turned, a grows into b all around.
+        """
+        if self.plan is None:
+            return front.rho, np.eye(self.claim.n)
+        b = _floats(front.axes)
+        held = flow.held_level(self.loop.value(k, end)[0], b) if self._joins_free(k, end) else front.rho
+        left, _, right = np.linalg.svd(np.linalg.solve(self.loop.axes(k, end, held, 0.0)[0], b))
+        return held, left @ right
 
     def _stretch(self, k: int, start: float, end: float, front: Front, first: Pair, last: Pair) -> Stretch:
         """The interval between two ellipsoids with their rates, its last one exactly the front's."""
@@ -160,9 +193,9 @@ class Descent:
     def _fastest_piece(self, k: int, start: float, end: float, front: Front, spare: float) -> tuple[Stretch, float]:
         """As `_piece` with ellipsoids of free shape; the level is that of the same volume."""
         loop, duration = self.loop, (end - start) * self.loop.dt
-        b = np.array([[float(c) for c in row] for row in front.axes])
+        b = _floats(front.axes)
         aims = self._directions[:, ::AIMS_SHARED]
-        w = flow.fastest_growth(loop, k, start, end, b, spare, cast(flow.Aim, self.aim), aims)
+        w = flow.fastest_growth(loop, k, start, end, b, spare, cast(flow.Plan, self.plan).aim, aims)
         if w is None:
             raise Refused("interval", "no ellipsoid can be carried back")
         a = b @ expm(-w * duration)

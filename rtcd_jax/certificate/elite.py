@@ -11,7 +11,7 @@ import numpy as np
 from rtcd_jax.certificate import check
 from rtcd_jax.certificate.check import Claim, Node, Witness
 from rtcd_jax.certificate.descent import AIMS_SHARED, SPARE, Descent, Front, directions
-from rtcd_jax.certificate.flow import Aim, best_aim
+from rtcd_jax.certificate.flow import Aim, Plan, best_plan
 from rtcd_jax.certificate.goal import GoalRegion, goal_region
 from rtcd_jax.certificate.loop import Loop, claim_of, double, doubles, sealed
 from rtcd_jax.files import replace, writing
@@ -96,7 +96,7 @@ def certify_elite(
     if region is None:
         return None
     goal, outlet = region
-    descent = Descent(claim, loop, exact, _aim(loop, outlet, arrays, journal) if optimize_value else None)
+    descent = Descent(claim, loop, exact, _plan(loop, outlet, arrays, journal) if optimize_value else None)
     front = _front(descent, claim, outlet, journal)
     for proved in descent.down_from(front):
         piece = proved.piece
@@ -163,16 +163,16 @@ def _region(claim: Claim, loop: Loop, exact: bool, journal: Journal) -> tuple[di
     return goal, region.outlet
 
 
-def _aim(loop: Loop, outlet: float, arrays: Mapping[str, np.ndarray], journal: Journal) -> Aim | None:
+def _plan(loop: Loop, outlet: float, arrays: Mapping[str, np.ndarray], journal: Journal) -> Plan | None:
     """How the shape is freed, from the journal if it is there; None keeps the elite's S."""
     for line in journal.lines:
-        if "aim" in line:
-            return line["aim"] and Aim(*line["aim"])
+        if "plan" in line:
+            return line["plan"] and Plan(Aim(*line["plan"][0]), line["plan"][1])
     last, aims = len(loop.u) - 1, directions(loop.n)[:, ::AIMS_SHARED]
     axes, _ = loop.axes(last, 1.0, outlet, 0.0)
-    aim = best_aim(loop, axes, np.asarray(arrays["rho"]), aims)
-    journal.append({"aim": aim})
-    return aim
+    plan = best_plan(loop, axes, np.asarray(arrays["rho"]), aims)
+    journal.append({"plan": plan})
+    return plan
 
 
 def _front(descent: Descent, claim: Claim, outlet: float, journal: Journal) -> Front:

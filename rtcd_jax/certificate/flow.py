@@ -31,6 +31,13 @@ class Aim(NamedTuple):
     attraction: float
 
 
+class Plan(NamedTuple):
+    """Free shapes with this aim from the knot `until` to the goal, TVLQR's level sets before it."""
+
+    aim: Aim
+    until: int
+
+
 AIMS = (Aim(0.1, 0.0), Aim(0.3, 0.0), Aim(1.0, 0.0), Aim(0.0, 1.0), Aim(0.0, 2.0))
 """To choose from: none is best for all elites."""
 ROUNDS = 6
@@ -48,7 +55,7 @@ LONGEST = 0.05
 PREDICTED_SPARE = 0.02
 """Spare rate [1/s] of predictions."""
 KEPT_INLET = 0.5
-"""Share of the TVLQR's inlet that an optimized funnel must keep to be preferred."""
+"""Share of the TVLQR's inlet that a funnel of free shapes alone must keep to be preferred."""
 
 
 def fastest_growth(
@@ -103,17 +110,27 @@ def _limits(loop: Loop, k: int, share: float, axes: np.ndarray, pairs: list) -> 
     return _products((axes[bounded] / widths[:, None]).T, pairs), -np.log(rooms[bounded] / widths) / SETTLING
 
 
-def predicted(loop: Loop, axes: np.ndarray, aim: Aim, y: np.ndarray) -> np.ndarray | None:
-    """Volumes [N+1], knots first, up to the unit ball's, if every interval goes through; None if it cannot."""
-    volumes = [np.linalg.det(axes)]
+def predicted(loop: Loop, axes: np.ndarray, aim: Aim, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """At the last M knots, down to where an interval has no W: volumes up to the unit ball's, and the levels of TVLQR's
+    largest level sets inside the ellipsoids."""
+    found = [_measures(loop, len(loop.u), axes)]
     for k in range(len(loop.u) - 1, -1, -1):
         for start, end in reversed(shares(loop)):
             w = fastest_growth(loop, k, start, end, axes, PREDICTED_SPARE, aim, y)
             if w is None:
-                return None
+                return tuple(np.array(found[::-1]).T)
             axes = axes @ expm(-w * (end - start) * loop.dt)
-        volumes.append(np.linalg.det(axes))
-    return np.array(volumes[::-1])
+        found.append(_measures(loop, k, axes))
+    return tuple(np.array(found[::-1]).T)
+
+
+def _measures(loop: Loop, k: int, axes: np.ndarray) -> tuple[float, float]:
+    return float(np.linalg.det(axes)), held_level(loop.values[k], axes)
+
+
+def held_level(s: np.ndarray, axes: np.ndarray) -> float:
+    """The largest rho with {x'S x <= rho} in {L y : |y| <= 1}."""
+    return float(np.linalg.eigvalsh(axes.T @ s @ axes)[0])
 
 
 def shares(loop: Loop) -> list[tuple[float, float]]:
@@ -122,12 +139,21 @@ def shares(loop: Loop) -> list[tuple[float, float]]:
     return [(i / parts, (i + 1) / parts) for i in range(parts)]
 
 
-def best_aim(loop: Loop, axes: np.ndarray, rhos: np.ndarray, y: np.ndarray) -> Aim | None:
-    """The aim with the largest sum of volumes that about keeps the inlet of the levels `rhos`; None: keep S."""
+def best_plan(loop: Loop, axes: np.ndarray, rhos: np.ndarray, y: np.ndarray) -> Plan | None:
+    """The plan with the largest sum of volumes; None: keep S throughout.
+
+    Before free shapes TVLQR's levels `rhos` [N+1] must be inside them, so that nothing is lost there; free shapes alone
+    must about keep the inlet.
+    """
     usual = rhos ** (loop.n / 2) / np.sqrt(np.linalg.det(loop.values))
     best, most = None, float(usual.sum())
     for aim in AIMS:
-        volumes = predicted(loop, axes, aim, y)
-        if volumes is not None and volumes.sum() > most and volumes[0] >= KEPT_INLET * usual[0]:
-            best, most = aim, float(volumes.sum())
+        volumes, levels = predicted(loop, axes, aim, y)
+        first = len(usual) - len(volumes)
+        for i, level in enumerate(levels):
+            k = first + i
+            total = float(usual[:k].sum() + volumes[i:].sum())
+            holds = level >= rhos[k] if k else volumes[0] >= KEPT_INLET * usual[0]
+            if holds and total > most:
+                best, most = Plan(aim, k), total
     return best

@@ -1,5 +1,6 @@
 """From a run folder to certificates: stored step by step, resumed after a kill, told in a table."""
 
+import itertools
 import json
 
 import numpy as np
@@ -183,6 +184,48 @@ def test_attraction_weighs_the_narrow_directions():
     np.testing.assert_allclose(flow._importance(g, 1.0), 2 * inverse / np.trace(inverse), rtol=1e-12)
     least = np.linalg.eigh(g)[1][:, 0]
     np.testing.assert_allclose(flow._importance(g, 40.0), 2 * np.outer(least, least), atol=1e-9)
+
+
+def test_level_sets_take_over_from_free_shapes_inside_them():
+    """Before the plan's knot L L' is a multiple of S^-1 again, and every interval is accepted by the checker."""
+    arrays, record = swing.elite()
+    claim = claimed(arrays, record)
+    loop = Loop(claim, arrays)
+    search = descent.Descent(claim, loop, exact=True, plan=flow.Plan(flow.Aim(0.3, 0.0), 2))
+    pieces = [each.piece for each in search.down_from(search.outlet(15.0))][::-1]
+    assert (pieces[0].knot, pieces[0].start) == (0, 0)
+    for before, after in itertools.pairwise(pieces):
+        assert before.last == after.first
+    for piece in pieces:
+        axes = np.array([[float(c) for c in row] for row in piece.first])
+        round_ = axes.T @ loop.value(piece.knot, float(piece.start))[0] @ axes
+        is_level_set = np.allclose(round_, round_[0, 0] * np.eye(2), rtol=1e-6, atol=1e-6 * round_[0, 0])
+        assert is_level_set == (piece.knot < 2)
+    axes = np.array([[float(c) for c in row] for row in pieces[-1].first])
+    held = flow.held_level(arrays["S"][3], axes)
+    y = np.linalg.inv(axes) @ np.linalg.cholesky(np.linalg.inv(arrays["S"][3]) * held) @ descent.directions(2)
+    assert np.linalg.norm(y, axis=0).max() == pytest.approx(1, abs=1e-4)
+
+
+def test_a_plan_switches_where_nothing_is_lost(monkeypatch):
+    """Free shapes down to knot 1, where they hold the usual level; further down they would cost the inlet."""
+    arrays, record = swing.elite()
+    loop, rho = Loop(claimed(arrays, record), arrays), np.full(5, 4.0)
+    usual = 4.0 / np.sqrt(np.linalg.det(arrays["S"]))
+    volumes = usual * np.array([0.4, 2.0, 3.0, 3.0, 1.0])
+    levels = np.array([1.0, 4.1, 3.9, 5.0, 4.0])
+
+    def predicted(loop, axes, aim, y):
+        return (volumes, levels) if aim == flow.AIMS[1] else (volumes[-1:], levels[-1:])
+
+    monkeypatch.setattr(flow, "predicted", predicted)
+    assert flow.best_plan(loop, np.eye(2), rho, None) == flow.Plan(flow.AIMS[1], 1)
+    levels[1] = 3.9
+    assert flow.best_plan(loop, np.eye(2), rho, None) == flow.Plan(flow.AIMS[1], 3)
+    volumes[0] = 0.6 * usual[0]
+    assert flow.best_plan(loop, np.eye(2), rho, None) == flow.Plan(flow.AIMS[1], 0)
+    volumes[:] = usual
+    assert flow.best_plan(loop, np.eye(2), rho, None) is None
 
 
 @pytest.mark.slow
