@@ -54,8 +54,8 @@ LONGEST = 0.05
 """Longest interval [s]: one W for a longer one gives volume away."""
 PREDICTED_SPARE = 0.02
 """Spare rate [1/s] of predictions."""
-KEPT_INLET = 0.5
-"""Share of the TVLQR's inlet that a funnel of free shapes alone must keep to be preferred."""
+KEPT_INLET = 0.9
+"""Share of the TVLQR's inlet that a plan must keep to be preferred."""
 
 
 def fastest_growth(
@@ -140,10 +140,9 @@ def shares(loop: Loop) -> list[tuple[float, float]]:
 
 
 def best_plan(loop: Loop, axes: np.ndarray, rhos: np.ndarray, y: np.ndarray) -> Plan | None:
-    """The plan with the largest sum of volumes; None: keep S throughout.
+    """The plan with the largest sum of volumes that about keeps the inlet; None: keep S throughout.
 
-    Before free shapes TVLQR's levels `rhos` [N+1] must be inside them, so that nothing is lost there; free shapes alone
-    must about keep the inlet.
+    Before a plan's knot TVLQR's levels `rhos` [N+1] are taken to shrink by the share that the free shape holds of them.
     """
     usual = rhos ** (loop.n / 2) / np.sqrt(np.linalg.det(loop.values))
     best, most = None, float(usual.sum())
@@ -152,8 +151,8 @@ def best_plan(loop: Loop, axes: np.ndarray, rhos: np.ndarray, y: np.ndarray) -> 
         first = len(usual) - len(volumes)
         for i, level in enumerate(levels):
             k = first + i
-            total = float(usual[:k].sum() + volumes[i:].sum())
-            holds = level >= rhos[k] if k else volumes[0] >= KEPT_INLET * usual[0]
-            if holds and total > most:
+            kept = np.minimum(level / rhos[k], 1) ** (loop.n / 2) if k else volumes[0] / usual[0]
+            total = float(kept * usual[:k].sum() + volumes[i:].sum())
+            if kept >= KEPT_INLET and total > most:
                 best, most = Plan(aim, k), total
     return best

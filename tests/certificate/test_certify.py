@@ -207,8 +207,8 @@ def test_level_sets_take_over_from_free_shapes_inside_them():
     assert np.linalg.norm(y, axis=0).max() == pytest.approx(1, abs=1e-4)
 
 
-def test_a_plan_switches_where_nothing_is_lost(monkeypatch):
-    """Free shapes down to knot 1, where they hold the usual level; further down they would cost the inlet."""
+def test_a_plan_switches_where_it_gains_most(monkeypatch):
+    """Free shapes as far as what they hold of the usual levels is worth it; a tenth of the inlet may be lost."""
     arrays, record = swing.elite()
     loop, rho = Loop(claimed(arrays, record), arrays), np.full(5, 4.0)
     usual = 4.0 / np.sqrt(np.linalg.det(arrays["S"]))
@@ -220,9 +220,11 @@ def test_a_plan_switches_where_nothing_is_lost(monkeypatch):
 
     monkeypatch.setattr(flow, "predicted", predicted)
     assert flow.best_plan(loop, np.eye(2), rho, None) == flow.Plan(flow.AIMS[1], 1)
-    levels[1] = 3.9
-    assert flow.best_plan(loop, np.eye(2), rho, None) == flow.Plan(flow.AIMS[1], 3)
-    volumes[0] = 0.6 * usual[0]
+    levels[1] = 3.7
+    assert flow.best_plan(loop, np.eye(2), rho, None) == flow.Plan(flow.AIMS[1], 1)
+    levels[1] = 3.5
+    assert flow.best_plan(loop, np.eye(2), rho, None) == flow.Plan(flow.AIMS[1], 2)
+    volumes[0] = 0.95 * usual[0]
     assert flow.best_plan(loop, np.eye(2), rho, None) == flow.Plan(flow.AIMS[1], 0)
     volumes[:] = usual
     assert flow.best_plan(loop, np.eye(2), rho, None) is None
