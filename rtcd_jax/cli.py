@@ -20,7 +20,7 @@ RUNS = Path("checkpoints")
 
 def optimize(arguments: Sequence[str]) -> int:
     """search for the design and the weights with the largest funnel, or resume a search"""
-    from rtcd_jax.options import read_optimize
+    from rtcd_jax.options.search import read_optimize
 
     config, options = read_optimize(arguments, RUNS)
 
@@ -34,7 +34,7 @@ def optimize(arguments: Sequence[str]) -> int:
 
 def sweep(arguments: Sequence[str]) -> int:
     """make all the runs that a YAML's sweep section asks for, or one of them"""
-    from rtcd_jax.options import read_sweep
+    from rtcd_jax.options.search import read_sweep
     from rtcd_jax.sweep import show
 
     cases, options = read_sweep(arguments, RUNS)
@@ -75,6 +75,7 @@ def _on_cluster(machines: Any, folder: Path, run: Callable[[Any, Any], None]) ->
     cluster.heed()
     with Console() if cluster.first else silent() as console:
         try:
+            cluster.meet()
             run(console, cluster)
         except Preempted:
             console.message(f"asked to stop (SIGTERM): saved in {folder}; the same command goes on")
@@ -100,7 +101,7 @@ def _leave(code: int) -> NoReturn:
 
 def scale(arguments: Sequence[str]) -> int:
     """measure what a generation costs against population and devices"""
-    from rtcd_jax.options import read_scale
+    from rtcd_jax.options.search import read_scale
 
     config, options = read_scale(arguments, RUNS)
     from rtcd_jax.console import Console
@@ -114,7 +115,7 @@ def scale(arguments: Sequence[str]) -> int:
 
 def verify(arguments: Sequence[str]) -> int:
     """simulate fresh random states of a run's funnels with independent integrators"""
-    from rtcd_jax.options import read_verify
+    from rtcd_jax.options.run import read_verify
 
     options = read_verify(arguments)
     prepare_jax()
@@ -128,7 +129,7 @@ def verify(arguments: Sequence[str]) -> int:
 
 def report(arguments: Sequence[str]) -> int:
     """write a run's figures and its page, or compare several runs on one"""
-    from rtcd_jax.options import read_report
+    from rtcd_jax.options.run import read_report
 
     options = read_report(arguments)
     from rtcd_jax.report import report as write_report
@@ -140,7 +141,7 @@ def report(arguments: Sequence[str]) -> int:
 
 def animate(arguments: Sequence[str]) -> int:
     """show the swing-up of a run's initial and best candidate as MP4 and GIF"""
-    from rtcd_jax.options import read_animate
+    from rtcd_jax.options.run import read_animate
 
     options = read_animate(arguments)
     prepare_jax()
@@ -154,7 +155,7 @@ def animate(arguments: Sequence[str]) -> int:
 
 def replay(arguments: Sequence[str]) -> int:
     """say whether a measured motion stayed inside a run's funnel"""
-    from rtcd_jax.options import read_replay
+    from rtcd_jax.options.run import read_replay
 
     options = read_replay(arguments)
     from rtcd_jax.console import Console
@@ -167,7 +168,7 @@ def replay(arguments: Sequence[str]) -> int:
 
 def certify(arguments: Sequence[str]) -> int:
     """prove the funnels of a run's elites by sums of squares"""
-    from rtcd_jax.options import read_certify
+    from rtcd_jax.options.proof import read_certify
 
     options = read_certify(arguments)
     from rtcd_jax.certificate.run import certify_run
@@ -180,7 +181,7 @@ def certify(arguments: Sequence[str]) -> int:
 
 def export(arguments: Sequence[str]) -> int:
     """write the controller, its funnel monitor and the design of an elite for a lab"""
-    from rtcd_jax.options import read_export
+    from rtcd_jax.options.run import read_export
 
     options = read_export(arguments)
     prepare_jax()
@@ -194,7 +195,7 @@ def export(arguments: Sequence[str]) -> int:
 
 def disturb(arguments: Sequence[str]) -> int:
     """try a run's best elite and its initial candidate: off-nominal starts, pushes, wrong models, noise, delay"""
-    from rtcd_jax.options import read_disturb
+    from rtcd_jax.options.run import read_disturb
 
     options = read_disturb(arguments)
     prepare_jax()
@@ -215,7 +216,7 @@ def check(arguments: Sequence[str]) -> int:
 
 def falsify(arguments: Sequence[str]) -> int:
     """simulate a great many motions of what a certificate says is proved"""
-    from rtcd_jax.options import read_falsify
+    from rtcd_jax.options.proof import read_falsify
 
     options = read_falsify(arguments)
     from rtcd_jax.certificate.falsify import falsify_file
@@ -228,7 +229,7 @@ def falsify(arguments: Sequence[str]) -> int:
 
 def audit(arguments: Sequence[str]) -> int:
     """show where a funnel from outside fails, and mend its nominal for a proof"""
-    from rtcd_jax.options import read_audit
+    from rtcd_jax.options.proof import read_audit
 
     options = read_audit(arguments)
     from rtcd_jax.certificate.audit import audit as run_audit

@@ -96,6 +96,12 @@ class Cluster:
         count = f"{len(self.devices)} {self.devices[0].device_kind} device{'s' if len(self.devices) > 1 else ''}"
         return f"{count} of {self.processes} processes" if self.processes > 1 else count
 
+    def meet(self) -> None:
+        """Opens the links between the processes, while none has work yet: that waits for the others for seconds only,
+        and later one may compile for minutes longer than another."""
+        self.agreed(np.zeros(1))
+        self.gathered(self.split(np.zeros(len(self.devices))))
+
     def agreed(self, value: Value) -> Value:
         """Process 0's numbers (a pytree of numpy's or Python's), on every process."""
         if self.processes == 1:

@@ -24,7 +24,7 @@ from rtcd_jax.spread import Spread, spread
 from rtcd_jax.storage import RunFolder, elite_names
 from rtcd_jax.types import Evaluation, Status
 
-LAST_FILE = Path("figures") / "convergence.pdf"
+LAST_FILE = Path("report.html")
 """Written when all else is."""
 
 
@@ -44,7 +44,8 @@ def optimize(config: Config, folder: Path, console: Console, cluster: Cluster) -
     with RunFolder.open(folder, config, cluster) as run:
         begun = run.restore(search.start(plan, example))
         done = int(begun.generation)
-        if done == config.search.generations and (folder / LAST_FILE).is_file():
+        whole = bool(cluster.agreed(np.asarray((folder / LAST_FILE).is_file())))
+        if done == config.search.generations and whole:
             console.message(f"{folder} is complete: {done} generations, {len(elite_names(folder))} elites")
             return
         if done:

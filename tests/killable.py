@@ -25,6 +25,7 @@ def main(path, mode, seconds, devices="1", port=None, processes="1", index="0"):
     cluster = Cluster.of()
     cluster.heed()
     try:
+        cluster.meet()
         drive(Path(path), experiment(mode), float(seconds), cluster)
     except Lost as error:
         print(error, flush=True)

@@ -13,7 +13,8 @@ from rtcd_jax.cli import LOST_PROCESS, PREEMPTED
 from tests.test_storage import driver, end, results
 
 ROOT = Path(__file__).parents[1]
-SLOWLY = 0.15
+SLOWLY = 0.5
+"""Seconds of a generation: a signal to one process takes some time to reach all."""
 
 
 def start(path, seconds=0.0, devices=1, processes=2):
@@ -93,6 +94,7 @@ def test_asked_to_stop_both_save_and_leave_and_one_process_goes_on_exactly(tmp_p
     assert results(tmp_path / "run") == whole
 
 
+@pytest.mark.slow
 def test_asked_to_stop_a_process_alone_saves_and_leaves(tmp_path, whole):
     process = driver(tmp_path / "run", "joint", SLOWLY)
     after(process, 3)
@@ -104,6 +106,7 @@ def test_asked_to_stop_a_process_alone_saves_and_leaves(tmp_path, whole):
     assert results(tmp_path / "run") == whole
 
 
+@pytest.mark.slow
 def test_processes_with_different_configurations_are_refused(tmp_path):
     processes = start(tmp_path / "run")
     other = [*processes[1].args[:4], "nested", *processes[1].args[5:]]

@@ -59,7 +59,17 @@ ALONE = {
 }
 
 # Modules that must start fast, so that wrong input is refused at once.
-QUICK = ("cli", "console", "config", "errors", "options", "settings", "certificate.check")
+QUICK = (
+    "cli",
+    "console",
+    "config",
+    "errors",
+    "options.search",
+    "options.run",
+    "options.proof",
+    "settings",
+    "certificate.check",
+)
 HEAVY = {"jax", "jaxtyping", "equinox", "evosax", "mujoco", "orbax", "scipy", "numpy", "matplotlib", "cvxpy"}
 
 

@@ -53,7 +53,7 @@ def reached(folder: Path, generation: int) -> None:
 
 @pytest.mark.parametrize("tasks", [pytest.param(1, marks=pytest.mark.slow), 2])
 def test_a_preempted_job_is_requeued_and_ends_with_the_same_bytes(cluster, whole, tmp_path, tasks):
-    number = submitted(cluster, tmp_path, tasks, seconds=0.2)
+    number = submitted(cluster, tmp_path, tasks, seconds=0.5)
     reached(tmp_path, 4)
     urgent = cluster.call(
         "sbatch", "--parsable", "--partition=high", "--exclusive", "--output=/dev/null", "--wrap=sleep 1"
@@ -70,7 +70,7 @@ def test_a_preempted_job_is_requeued_and_ends_with_the_same_bytes(cluster, whole
 
 @pytest.mark.slow
 def test_a_cancelled_job_does_not_come_back(cluster, tmp_path):
-    number = submitted(cluster, tmp_path, 1, seconds=0.2)
+    number = submitted(cluster, tmp_path, 1, seconds=0.5)
     reached(tmp_path, 3)
     cluster.call("scancel", number)
     assert cluster.ended(number)["JobState"] == "CANCELLED"
