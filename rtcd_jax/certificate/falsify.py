@@ -138,11 +138,12 @@ def summed(seen: list[Seen], steps: int) -> Found:
 
 def sentence(motions: Motions, found: Found) -> str:
     """What was seen, in plain words."""
+    nearest = f"closest {found.share_of_limit:.6f} of it" if found.share_of_limit else "there is none"
     return (
         f"{found.rollouts} simulated motions of the {motions.plant} from instants all over [{motions.start:.6g} s, "
         f"{motions.end:.6g} s], half of them from the funnel's boundary: {found.left_funnel} left the funnel (largest "
-        f"|y| after the start {found.level:.9f}), {found.left_limits} exceeded a limit on the states (closest "
-        f"{found.share_of_limit:.6f} of it), {found.moved_away} moved away from the goal in the goal region, "
+        f"|y| after the start {found.level:.9f}), {found.left_limits} exceeded a limit on the states "
+        f"({nearest}), {found.moved_away} moved away from the goal in the goal region, "
         f"{found.not_arrived} did not arrive. Integrator: {found.steps} classical Runge-Kutta steps an interval; "
         f"halved steps change |y| of every {REPEATED}th motion by {found.error:.2g} at most; beyond 1 counts from "
         f"{found.allowance:.2g} on."
