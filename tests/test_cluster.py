@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 
 from rtcd_jax.cli import LOST_PROCESS, PREEMPTED
+from tests.test_run import Small, contents
 from tests.test_storage import driver, end, results
 
 ROOT = Path(__file__).parents[1]
@@ -115,3 +116,21 @@ def test_processes_with_different_configurations_are_refused(tmp_path):
     processes[1] = subprocess.Popen(other, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
     outputs = [end(process) for process in processes]
     assert all("started with different values of: configuration" in output for output in outputs), outputs
+
+
+@pytest.mark.slow
+def test_a_real_run_of_two_processes_ends_with_the_bytes_of_two_devices(tmp_path):
+    small = Small(tmp_path)
+    code, output, errors = small.optimize(tmp_path / "devices", "--cpu_devices", 2)
+    assert code == 0, output + errors
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    shared = ("--coordinator", f"127.0.0.1:{port}", "--num_processes", 2, "--cpu_devices", 1)
+    words = (small.config, "--run", tmp_path / "processes", *shared)
+    processes = [small.start("optimize", *words, "--process_id", index) for index in range(2)]
+    outputs = [process.communicate(timeout=600) for process in processes]
+    assert [process.returncode for process in processes] == [0, 0], outputs
+    assert "on 2 cpu devices of 2 processes" in outputs[0][0]
+    assert "generation" not in outputs[1][0]
+    assert contents(tmp_path / "processes") == contents(tmp_path / "devices")

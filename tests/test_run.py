@@ -88,7 +88,7 @@ def finished(small, tmp_path_factory) -> Path:
     return folder
 
 
-def _contents(folder: Path) -> dict[str, bytes]:
+def contents(folder: Path) -> dict[str, bytes]:
     """Bytes of all that must not depend on interruptions."""
     patterns = ("generations.jsonl", "config.yaml", "initial.*", "elites/*")
     found = {str(path.relative_to(folder)): path.read_bytes() for p in patterns for path in sorted(folder.glob(p))}
@@ -136,22 +136,22 @@ def test_the_stored_configuration_is_the_runs(finished, small):
 
 
 def test_a_finished_run_says_so_and_is_left_as_it_is(finished, small):
-    before = _contents(finished)
+    before = contents(finished)
     code, output, errors = small.optimize(finished)
     assert code == 0, errors
     assert f"is complete: {GENERATIONS} generations, {len(elite_names(finished))} elites" in output
     assert "generation 1/" not in output
-    assert _contents(finished) == before
+    assert contents(finished) == before
 
 
 def test_another_configuration_is_refused_by_its_key(finished, small):
-    before = _contents(finished)
+    before = contents(finished)
     code, _, errors = small.optimize(finished, "--search.sigma", "0.2")
     assert code == 2
     assert "another configuration" in errors
     assert "search.sigma: 0.3 in the folder, 0.2 now" in errors
     assert "funnel." not in errors
-    assert _contents(finished) == before
+    assert contents(finished) == before
 
 
 def test_the_run_keeps_its_promise(finished, small):
@@ -184,7 +184,7 @@ def test_a_killed_run_ends_as_if_nothing_had_happened(finished, small, tmp_path)
     code, output, errors = small.optimize(folder)
     assert code == 0, errors
     assert "going on after generation" in output
-    assert _contents(folder) == _contents(finished)
+    assert contents(folder) == contents(finished)
 
 
 @pytest.mark.slow
@@ -199,7 +199,7 @@ def test_a_run_killed_at_random_moments_ends_as_if_nothing_had_happened(finished
     assert kills > 0
     code, _, errors = small.optimize(folder)
     assert code == 0, errors
-    assert _contents(folder) == _contents(finished)
+    assert contents(folder) == contents(finished)
 
 
 @pytest.mark.slow
@@ -222,11 +222,11 @@ def test_fifty_kills_over_the_smoke_run_change_nothing(tmp_path):
             killed += 1
         else:
             assert process.returncode == 0, output + errors
-            assert _contents(folder) == _contents(whole)
+            assert contents(folder) == contents(whole)
             shutil.rmtree(folder)
     code, output, errors = smoke.optimize(folder)
     assert code == 0, output + errors
-    assert _contents(folder) == _contents(whole)
+    assert contents(folder) == contents(whole)
     assert not list(folder.rglob(".*.tmp"))
 
 
@@ -241,7 +241,7 @@ def test_a_run_killed_while_it_stores_its_elites_stores_them_all(finished, small
     code, output, errors = small.optimize(folder)
     assert code == 0, errors
     assert "generation 1/" not in output
-    assert _contents(folder) == _contents(finished)
+    assert contents(folder) == contents(finished)
     assert (folder / LAST_FILE).is_file()
 
 
