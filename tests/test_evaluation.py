@@ -72,6 +72,7 @@ def test_neighbors_do_not_matter():
     assert broken.volumes.total[2] == 0
 
 
+@pytest.mark.slow
 def test_a_population_is_its_candidates_one_by_one():
     """The program for one is another one: equal but for rounding."""
     alone = jax.jit(make_evaluate(pipeline.problem()))

@@ -262,6 +262,7 @@ def _generations():
     return _known(search_effort(pipeline.problem()))
 
 
+@pytest.mark.slow
 def test_a_generations_levels_do_not_depend_on_the_rollouts_step():
     """Halved steps move none by 0.1 % (0.005 % measured)."""
     for fine, coarse in zip(_known(_doubled(search_effort(pipeline.problem()), "steps")), _generations(), strict=True):
@@ -282,6 +283,7 @@ def test_a_generations_levels_are_resolved():
     _assert_resolved(_known(_doubled(search_effort(pipeline.problem()), "directions")), _generations())
 
 
+@pytest.mark.slow
 def test_the_elites_levels_are_resolved():
     """Before fresh states shrink them; they are those of a generation, within 1 % (0.5 % measured)."""
     effort = dataclasses.replace(elite_effort(pipeline.problem()), rounds=0, follow=False)

@@ -230,6 +230,7 @@ def test_fifty_kills_over_the_smoke_run_change_nothing(tmp_path):
     assert not list(folder.rglob(".*.tmp"))
 
 
+@pytest.mark.slow
 def test_a_run_killed_while_it_stores_its_elites_stores_them_all(finished, small, tmp_path):
     """Whatever is missing at its end, the same command brings the same bytes."""
     folder = tmp_path / "torn"
