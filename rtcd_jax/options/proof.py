@@ -17,6 +17,8 @@ class CertifyOptions:
 
     Rungs: certified, by the solver's floating-point numbers; proved, by exact arithmetic for the true dynamics. The
     same command goes on after a kill. Exit code 1 if a funnel was not shown from t = 0 to the goal.
+
+    example: rtcd certify checkpoints/pendulum_rtcd --elites 8 --optimize_value
     """
 
     run: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RUN", help="the run folder")]
