@@ -112,7 +112,7 @@ def ffmpeg() -> str | None:
     if found:
         return found
     with contextlib.suppress(ImportError, RuntimeError):
-        from imageio_ffmpeg import get_ffmpeg_exe
+        from imageio_ffmpeg import get_ffmpeg_exe  # pyright: ignore[reportMissingImports]
 
         return get_ffmpeg_exe()
     return None
