@@ -200,4 +200,6 @@ def _summary(problem: Problem, initial: Evaluation, best: Evaluation) -> Iterato
         for name, unit in problem.plant.design_units.items()
     )
     weights = ", ".join(f"{value:.4g}" for value in (*best.candidate.q.tolist(), *best.candidate.r.tolist()))
-    yield f"best: {design}; diagonals of Q and R: {weights}"
+    options = {"authority": best.candidate.authority, "discount": best.candidate.discount}
+    searched = "".join(f"; {name} {float(value):.4g}" for name, value in options.items() if value is not None)
+    yield f"best: {design}; diagonals of Q and R: {weights}{searched}"

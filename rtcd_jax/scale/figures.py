@@ -38,6 +38,10 @@ def _by(rows: Rows, name: str) -> dict[int, list[Mapping[str, Any]]]:
     return {value: [row for row in rows if row[name] == value] for value in sorted({row[name] for row in rows})}
 
 
+def _many(devices: int) -> str:
+    return f"{devices} device{'s' if devices > 1 else ''}"
+
+
 def _labels(axis: Axes, title: str, x: str, y: str) -> None:
     axis.set(title=title, xlabel=x, ylabel=y)
     axis.grid(alpha=0.3)
@@ -51,7 +55,7 @@ def _rate(axis: Axes, rows: Rows) -> None:
         low = [rate - row["candidates_per_s_min"] for rate, row in zip(rates, part, strict=True)]
         high = [row["candidates_per_s_max"] - rate for rate, row in zip(rates, part, strict=True)]
         axis.errorbar(
-            [row["population"] for row in part], rates, [low, high], marker="o", capsize=3, label=f"{devices} devices"
+            [row["population"] for row in part], rates, [low, high], marker="o", capsize=3, label=_many(devices)
         )
     axis.set_xscale("log", base=2)
     _labels(axis, "rate (median, least and most)", "population", "candidates/s")
@@ -60,12 +64,10 @@ def _rate(axis: Axes, rows: Rows) -> None:
 def _cost(axis: Axes, rows: Rows) -> None:
     for devices, part in _by(rows, "devices").items():
         sizes = [row["population"] for row in part]
-        axis.plot(
-            sizes, [row["device_ms_per_candidate"] for row in part], "o-", label=f"device time, {devices} devices"
-        )
-        axis.plot(sizes, [row["cpu_ms_per_candidate"] for row in part], "x--", label=f"CPU time, {devices} devices")
+        axis.plot(sizes, [row["device_ms_per_candidate"] for row in part], "o-", label=f"device time, {_many(devices)}")
+        axis.plot(sizes, [row["cpu_ms_per_candidate"] for row in part], "x--", label=f"CPU time, {_many(devices)}")
     axis.set_xscale("log", base=2)
-    axis.set_yscale("log")
+    axis.set_ylim(bottom=0)
     _labels(axis, "cost of a candidate", "population", "ms a candidate")
 
 
@@ -76,6 +78,7 @@ def _strong(axis: Axes, rows: Rows) -> None:
         speedups = [row["candidates_per_s"] / first["candidates_per_s"] * first["devices"] for row in part]
         axis.plot([row["devices"] for row in part], speedups, "o-", label=f"population {population}")
     axis.plot(counts, counts, "k:", label="ideal")
+    axis.set_xticks(counts)
     _labels(axis, "strong scaling", "devices", "speed-up")
 
 
@@ -89,6 +92,8 @@ def _weak(axis: Axes, rows: Rows) -> None:
             kept = [first["generation_s"] / row["generation_s"] for row in part]
             axis.plot([row["devices"] for row in part], kept, "o-", label=f"{share:g} candidates a device")
     axis.axhline(1, color="k", linestyle=":", label="ideal")
+    axis.set_xticks(sorted({row["devices"] for row in rows}))
+    axis.set_ylim(0, 1.15)
     _labels(axis, "weak scaling", "devices", "efficiency")
 
 
