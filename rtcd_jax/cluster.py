@@ -8,7 +8,7 @@ import contextlib
 import os
 import signal
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import partial
 from typing import Any, TypeVar, final
 
@@ -64,7 +64,6 @@ class Cluster:
 
     devices: tuple[jax.Device, ...]
     _asked: bool = False
-    _looks: int = field(default=0, repr=False)
 
     @classmethod
     def of(cls, limit: int | None = None) -> "Cluster":
@@ -170,8 +169,12 @@ class Cluster:
         """Makes the next look raise."""
         self._asked = True
 
-    def look(self) -> None:
-        """Raises Preempted if this run was asked to stop; in all processes at the same one of their looks."""
-        self._looks += 1
-        if self._asked or (self.processes > 1 and multihost_utils.reached_preemption_sync_point(self._looks)):
+    def look(self, step: int | None = None) -> None:
+        """Raises Preempted if this run was asked to stop.
+
+        Several processes agree on one of their looks, for which they need a `step` that grows from look to look: that
+        of the checkpoint where one is saved, because orbax looks, too. Without a step only a process alone looks.
+        """
+        together = self.processes > 1 and step is not None and multihost_utils.reached_preemption_sync_point(step)
+        if self._asked or together:
             raise Preempted

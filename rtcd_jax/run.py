@@ -58,11 +58,13 @@ def optimize(config: Config, folder: Path, console: Console, cluster: Cluster) -
                 run.append(vars(generation))
                 run.save_if_due(state, int(state.generation))
                 console.progress(_progress(config, generation, clock))
+                cluster.look(int(state.generation))
         except Preempted:
             run.save(state, int(state.generation))
             raise
         run.save(state, int(state.generation))
-        found = again([*_filled(state.elites), _initial(problem, evaluate)], search.last_key(plan), console)
+        last = config.search.generations
+        found = again([*_filled(state.elites), _initial(problem, evaluate)], search.last_key(plan), last + 1, console)
         finished = search.finish(plan, state, _stacked(found[:-1], state.elites))
         cluster.on_first(lambda: _store(problem, finished, found[-1], run, console))
 
@@ -123,12 +125,14 @@ class _Again:
     def _split(self, evaluations: Sequence[Evaluation]) -> Evaluation:
         return self._cluster.split(jax.tree.map(lambda *leaves: np.stack(leaves), *evaluations))
 
-    def __call__(self, evaluations: Sequence[Evaluation], key: jax.Array, console: Console) -> list[Evaluation]:
-        """Each with its funnel sampled again. Raises Preempted between two rounds."""
+    def __call__(
+        self, evaluations: Sequence[Evaluation], key: jax.Array, step: int, console: Console
+    ) -> list[Evaluation]:
+        """Each with its funnel sampled again. Raises Preempted between two rounds, the first look being at `step`."""
         devices, whole = len(self._cluster.devices), self._cluster.replicated(jax.random.key_data(key))
         found: list[Evaluation] = []
         for begin in range(0, len(evaluations), devices):
-            self._cluster.look()
+            self._cluster.look(step + begin)
             batch = [*evaluations[begin : begin + devices]]
             batch += batch[-1:] * (devices - len(batch))
             sampled = self._cluster.gathered(self._program.result()(self._split(batch), whole))

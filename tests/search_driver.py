@@ -60,6 +60,7 @@ def drive(path, config, seconds=0.0, cluster=None):
                 folder.append(vars(record))
                 print("generation", record.index, flush=True)
                 folder.save_if_due(state, int(state.generation))
+                cluster.look(int(state.generation))
         except Preempted:
             folder.save(state, int(state.generation))
             print("preempted", int(state.generation), flush=True)

@@ -319,6 +319,7 @@ def _room(problem, policy):
     return problem.state_limits - np.abs(np.asarray(policy.trajectory.xs)).max(0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("share", [0.9, 1.0])
 def test_a_motion_that_keeps_off_the_limits_leaves_room_for_a_funnel(share):
     """It goes up to its share of them, and the ellipsoids fill at most the rest; a motion on a limit has none there."""

@@ -113,7 +113,7 @@ def test_mjx_step_of_a_batch_is_the_loop_of_steps(robot, mjx_step):
         np.testing.assert_allclose(batched[index], single, rtol=1e-14, atol=1e-14)
 
 
-@pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
+@pytest.mark.parametrize("dtype", [pytest.param(jnp.float32, marks=pytest.mark.slow), jnp.float64])
 def test_mjx_scans_under_strict_promotion_in_the_states_dtype(robot, dtype):
     stepper = MjxStepper(robot.plant)
     designs, x0, us = jax.tree.map(lambda leaf: leaf.astype(dtype), (robot.designs, robot.x, robot.u))
