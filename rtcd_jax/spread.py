@@ -16,12 +16,11 @@ import numpy as np
 from jaxtyping import Array, Float, Int, Key
 
 from rtcd_jax.cluster import Cluster
+from rtcd_jax.evaluation import Evaluate
 from rtcd_jax.types import Evaluation, Volumes
 
 POLL = 0.01
 """Seconds between two looks at whether a chunk is done."""
-
-Evaluate = Callable[[jax.Array, jax.Array], Evaluation]
 
 
 @final

@@ -6,6 +6,7 @@ from typing import Annotated
 import tyro
 
 from rtcd_jax.errors import UserError
+from rtcd_jax.options.checks import require_at_least
 
 _COORDINATOR = "where process 0 listens; srun and mpirun need none"
 
@@ -22,10 +23,7 @@ class Machines:
 
     def require_sense(self) -> None:
         """Raises `UserError` unless all of coordinator, number and id are given, or none, and all are in range."""
-        for name, least in (("devices", 1), ("cpu_devices", 1), ("num_processes", 1), ("process_id", 0)):
-            value = getattr(self, name)
-            if value is not None and value < least:
-                raise UserError(f"--{name} = {value}: must be >= {least}")
+        require_at_least(self, devices=1, cpu_devices=1, num_processes=1, process_id=0)
         together = ("coordinator", "num_processes", "process_id")
         missing = [f"--{name}" for name in together if getattr(self, name) is None]
         if 0 < len(missing) < len(together):

@@ -8,7 +8,8 @@ from typing import Annotated, Literal
 import tyro
 
 from rtcd_jax.errors import UserError
-from rtcd_jax.options.run import require_run
+from rtcd_jax.options.checks import require_at_least, require_run
+from rtcd_jax.options.search import OPTIMIZE_USAGE
 
 
 @dataclass(frozen=True)
@@ -83,19 +84,15 @@ class AuditOptions:
 def read_certify(arguments: Sequence[str]) -> CertifyOptions:
     """The checked options of `rtcd certify`; `UserError` if one is out of range."""
     options = tyro.cli(CertifyOptions, args=arguments, prog="rtcd certify", use_underscores=True)
-    for name in ("elites", "workers"):
-        if getattr(options, name) < 1:
-            raise UserError(f"--{name} = {getattr(options, name)}: must be >= 1")
-    require_run(options.run)
+    require_at_least(options, elites=1, workers=1)
+    require_run(options.run, OPTIMIZE_USAGE)
     return options
 
 
 def read_falsify(arguments: Sequence[str]) -> FalsifyOptions:
     """The checked options of `rtcd falsify`; `UserError` if one is out of range."""
     options = tyro.cli(FalsifyOptions, args=arguments, prog="rtcd falsify", use_underscores=True)
-    for name, least in (("rollouts", 1), ("seed", 0), ("workers", 1)):
-        if getattr(options, name) < least:
-            raise UserError(f"--{name} = {getattr(options, name)}: must be >= {least}")
+    require_at_least(options, rollouts=1, seed=0, workers=1)
     if options.certificate.is_dir():
         return replace(options, certificate=options.certificate / "certificates" / "000.json")
     return options
@@ -104,7 +101,5 @@ def read_falsify(arguments: Sequence[str]) -> FalsifyOptions:
 def read_audit(arguments: Sequence[str]) -> AuditOptions:
     """The checked options of `rtcd audit`; `UserError` if one is out of range."""
     options = tyro.cli(AuditOptions, args=arguments, prog="rtcd audit", use_underscores=True)
-    for name, least in (("states", 1), ("seed", 0)):
-        if getattr(options, name) < least:
-            raise UserError(f"--{name} = {getattr(options, name)}: must be >= {least}")
+    require_at_least(options, states=1, seed=0)
     return options

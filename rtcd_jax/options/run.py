@@ -8,6 +8,7 @@ from typing import Annotated, Literal
 import tyro
 
 from rtcd_jax.errors import UserError
+from rtcd_jax.options.checks import require_at_least, require_elite, require_run
 from rtcd_jax.options.search import OPTIMIZE_USAGE
 
 
@@ -94,10 +95,8 @@ class ExportOptions:
 def read_verify(arguments: Sequence[str]) -> VerifyOptions:
     """The checked options of `rtcd verify`; `UserError` if one is out of range."""
     options = tyro.cli(VerifyOptions, args=arguments, prog="rtcd verify", use_underscores=True)
-    for name, least in (("states", 1), ("seed", 0), ("workers", 0)):
-        if getattr(options, name) < least:
-            raise UserError(f"--{name} = {getattr(options, name)}: must be >= {least}")
-    require_run(options.run)
+    require_at_least(options, states=1, seed=0, workers=0)
+    require_run(options.run, OPTIMIZE_USAGE)
     return options
 
 
@@ -107,48 +106,37 @@ def read_report(arguments: Sequence[str]) -> ReportOptions:
     if not options.runs:
         raise UserError("which run? rtcd report RUN [RUN …] [--to FILE]")
     for run in options.runs:
-        require_run(run)
+        require_run(run, OPTIMIZE_USAGE)
     return options
 
 
 def read_animate(arguments: Sequence[str]) -> AnimateOptions:
     """The checked options of `rtcd animate`; `UserError` if one is out of range."""
     options = tyro.cli(AnimateOptions, args=arguments, prog="rtcd animate", use_underscores=True)
-    if options.seed < 0:
-        raise UserError(f"--seed = {options.seed}: must be >= 0")
-    require_run(options.run)
+    require_at_least(options, seed=0)
+    require_run(options.run, OPTIMIZE_USAGE)
     return options
 
 
 def read_replay(arguments: Sequence[str]) -> ReplayOptions:
     """The checked options of `rtcd replay`; `UserError` if one is out of range."""
     options = tyro.cli(ReplayOptions, args=arguments, prog="rtcd replay", use_underscores=True)
-    if isinstance(options.elite, int) and options.elite < 0:
-        raise UserError(f"--elite = {options.elite}: must be >= 0, or initial")
-    require_run(options.run)
+    require_elite(options.elite)
+    require_run(options.run, OPTIMIZE_USAGE)
     return options
 
 
 def read_disturb(arguments: Sequence[str]) -> DisturbOptions:
     """The checked options of `rtcd disturb`; `UserError` if one is out of range."""
     options = tyro.cli(DisturbOptions, args=arguments, prog="rtcd disturb", use_underscores=True)
-    if options.states < 1:
-        raise UserError(f"--states = {options.states}: must be >= 1")
-    if options.seed < 0:
-        raise UserError(f"--seed = {options.seed}: must be >= 0")
-    require_run(options.run)
+    require_at_least(options, states=1, seed=0)
+    require_run(options.run, OPTIMIZE_USAGE)
     return options
 
 
 def read_export(arguments: Sequence[str]) -> ExportOptions:
     """The checked options of `rtcd export`; `UserError` if one is out of range."""
     options = tyro.cli(ExportOptions, args=arguments, prog="rtcd export", use_underscores=True)
-    if isinstance(options.elite, int) and options.elite < 0:
-        raise UserError(f"--elite = {options.elite}: must be >= 0, or initial")
-    require_run(options.run)
+    require_elite(options.elite)
+    require_run(options.run, OPTIMIZE_USAGE)
     return options
-
-
-def require_run(folder: Path) -> None:
-    if not folder.is_dir():
-        raise UserError(f"{folder}: no such run folder; `{OPTIMIZE_USAGE}` makes one")

@@ -10,6 +10,7 @@ from tyro.constructors import ConstructorRegistry
 
 from rtcd_jax.config import EXAMPLE, SMALLEST_POPULATION, Config, load, parse, parse_yaml
 from rtcd_jax.errors import UserError
+from rtcd_jax.options.checks import require_at_least
 from rtcd_jax.options.machines import Machines
 from rtcd_jax.options.tree import Branch, config_branch, plain
 from rtcd_jax.sweep import Case, read_cases
@@ -101,8 +102,7 @@ def read_sweep(arguments: Sequence[str], runs: Path) -> tuple[list[Case], SweepO
 def read_scale(arguments: Sequence[str], runs: Path) -> tuple[Config, ScaleOptions]:
     """The configuration and the options; `UserError` for a wrong YAML or number."""
     options = tyro.cli(ScaleOptions, args=arguments, prog="rtcd scale", use_underscores=True)
-    if options.repeats < 1:
-        raise UserError(f"--repeats = {options.repeats}: must be >= 1")
+    require_at_least(options, repeats=1)
     for name, least in (("populations", SMALLEST_POPULATION), ("devices", 1)):
         if min(options.counts(name)) < least:
             raise UserError(f"--{name} = {getattr(options, name)}: all must be >= {least}")
