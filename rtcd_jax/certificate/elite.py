@@ -1,8 +1,10 @@
 """One elite's certificate: goal region, then funnel, every step kept on disk, so that a killed search goes on."""
 
+import contextlib
+import itertools
 import json
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple, final
 
@@ -56,15 +58,12 @@ class Outcome(NamedTuple):
 class Journal:
     """The finished steps of one elite's certificate, one JSON line each; the first line says of which claim and rung.
 
-    Lines of another claim or rung, and a torn last one, are dropped.
+    Lines of another claim or rung are dropped, and what follows a torn one.
     """
 
     def __init__(self, path: Path, head: Mapping[str, Any]):
         self.path = path
-        lines = []
-        if path.is_file():
-            with path.open("rb") as file:
-                lines = [json.loads(line) for line in file if line.endswith(b"\n")]
+        lines = list(_whole(path)) if path.is_file() else []
         self.lines = lines[1:] if lines and lines[0] == head else []
         replace(path, "".join(f"{json.dumps(line)}\n" for line in (head, *self.lines)).encode())
 
@@ -72,6 +71,13 @@ class Journal:
         self.lines.append(dict(line))
         with writing(self.path), self.path.open("ab") as file:
             file.write(f"{json.dumps(line)}\n".encode())
+
+
+def _whole(path: Path) -> Iterator[dict[str, Any]]:
+    """A journal's lines up to the first one that is torn or damaged."""
+    with path.open("rb") as file, contextlib.suppress(TypeError, ValueError):
+        for line in itertools.takewhile(lambda line: line.endswith(b"\n"), file):
+            yield dict(json.loads(line))
 
 
 def certify_elite(
