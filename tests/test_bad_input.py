@@ -165,7 +165,7 @@ OTHERS = {
     "no page": (["report", "run", "--to", "run"], "--to = run: must be a file, and this is a folder"),
     "no place for a page": (
         ["report", "run", "--to", "measured.csv/page.html"],
-        "cannot write measured.csv/page_figures",
+        "cannot write measured.csv/",
     ),
     "no measured file": (["replay", "run", "no.csv"], "no.csv: no such file; must be a CSV of measured states"),
     "a folder, measured": (["replay", "run", "run"], "run: no such file; must be a CSV of measured states"),
