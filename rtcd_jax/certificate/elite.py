@@ -10,9 +10,9 @@ import numpy as np
 
 from rtcd_jax.certificate import check
 from rtcd_jax.certificate.check import Claim, Node, Witness
-from rtcd_jax.certificate.descent import AIMS_SHARED, SPARE, Descent, Front, directions
-from rtcd_jax.certificate.flow import Aim, Plan, best_plan
+from rtcd_jax.certificate.descent import SPARE, Descent, Front
 from rtcd_jax.certificate.goal import GoalRegion, goal_region
+from rtcd_jax.certificate.joint import largest
 from rtcd_jax.certificate.loop import Loop, claim_of, double, doubles, sealed
 from rtcd_jax.files import replace, writing
 from rtcd_jax.storage import read_elite
@@ -92,11 +92,13 @@ def certify_elite(
     journal = Journal(
         folder / f".{name}.partial.jsonl", {"claim": check.seal(told), "rung": rung, "optimize_value": optimize_value}
     )
+    if optimize_value:
+        loop = _shaped(loop, journal)
     region = _region(claim, loop, exact, journal)
     if region is None:
         return None
     goal, outlet = region
-    descent = Descent(claim, loop, exact, _plan(loop, outlet, arrays, journal) if optimize_value else None)
+    descent = Descent(claim, loop, exact)
     front = _front(descent, claim, outlet, journal)
     for proved in descent.down_from(front):
         piece = proved.piece
@@ -163,16 +165,14 @@ def _region(claim: Claim, loop: Loop, exact: bool, journal: Journal) -> tuple[di
     return goal, region.outlet
 
 
-def _plan(loop: Loop, outlet: float, arrays: Mapping[str, np.ndarray], journal: Journal) -> Plan | None:
-    """How the shape is freed, from the journal if it is there; None keeps the elite's S."""
+def _shaped(loop: Loop, journal: Journal) -> Loop:
+    """The loop with the value function that is optimized with the funnel, from the journal if it is there."""
     for line in journal.lines:
-        if "plan" in line:
-            return line["plan"] and Plan(Aim(*line["plan"][0]), line["plan"][1])
-    last, aims = len(loop.u) - 1, directions(loop.n)[:, ::AIMS_SHARED]
-    axes, _ = loop.axes(last, 1.0, outlet, 0.0)
-    plan = best_plan(loop, axes, np.asarray(arrays["rho"]), aims)
-    journal.append({"plan": plan})
-    return plan
+        if "values" in line:
+            return loop.shaped(np.array(line["values"]), np.array(line["slopes"]))
+    loop = largest(loop)
+    journal.append({"values": loop.values.tolist(), "slopes": loop.slopes.tolist()})
+    return loop
 
 
 def _front(descent: Descent, claim: Claim, outlet: float, journal: Journal) -> Front:
