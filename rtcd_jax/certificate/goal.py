@@ -34,7 +34,10 @@ class GoalRegion(NamedTuple):
 def goal_region(claim: Claim, loop: Loop, exact: bool) -> GoalRegion | None:
     """The first level of the ladder that goes through; None if none does."""
     aims = directions(claim.n)
-    most = goal_level(loop, aims)
+    try:
+        most = goal_level(loop, aims)
+    except Refused:
+        return None
     for share in LADDER:
         found = _at_level(claim, loop, share * most, exact, aims)
         if found is not None:

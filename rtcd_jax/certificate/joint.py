@@ -20,7 +20,7 @@ import numpy as np
 import scipy.sparse as sp
 from scipy.optimize import linprog
 
-from rtcd_jax.certificate.check import Refused
+from rtcd_jax.certificate.check import Refused, insist
 from rtcd_jax.certificate.levels import carried_back, directions, goal_level
 from rtcd_jax.certificate.loop import Loop, hermite
 
@@ -30,7 +30,7 @@ LEVELS = np.linspace(0.1, 1, 10)
 """Where it is asked for at the goal: |y|."""
 SPARED = 0.02
 """Spare rate of V [1/s]."""
-TRUST = (0.3, 0.4, 5e-3)
+TRUST = (0.3, 0.4, 0.01)
 """Largest change of an entry of P in units of the ellipsoid: at first, ever, and where the search ends."""
 BENDING = 4.0
 """The rates of P may change by so much more in the time of an interval."""
@@ -42,7 +42,7 @@ THINNED = {2: 8, 4: 4}
 """By the number of states: the linear programs get one of so many directions,"""
 TRIED = {2: 2, 4: 4}
 """and the levels that follow one of so many;"""
-KEPT = 90
+KEPT = 40
 """and at every instant no more than so many, those where V falls least."""
 WORTH = 1e-3
 """What a step must gain, or the next one is shorter."""
@@ -87,7 +87,9 @@ def leveled(loop: Loop, aims: np.ndarray) -> Loop:
         rho = carried.rho
         values[k] /= rho
         slopes[k, 0] = slopes[k, 0] / rho - carried.first * values[k]
-    return loop.shaped(values, slopes)
+    other = loop.shaped(values, slopes)
+    insist(np.linalg.eigvalsh(_values(other)[0]).min() > 0, "funnel", "S is not positive definite between knots")
+    return other
 
 
 def merit(loop: Loop) -> float:
@@ -108,18 +110,26 @@ def _values(loop: Loop) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _step(loop: Loop, trust: float, aims: np.ndarray) -> Loop | None:
-    """The loop after one linear program; None if that is no funnel."""
+    """The funnel after one linear program; None if there is none."""
+    try:
+        return leveled(changed(loop, trust), aims)
+    except (Refused, np.linalg.LinAlgError):
+        return None
+
+
+def changed(loop: Loop, trust: float) -> Loop:
+    """The loop after one linear program: a funnel up to what is of second order in `trust`.
+
+    Raises:
+        Refused: the solver found no solution.
+    """
     program = Program(loop, trust)
     rows = [program.falling(), program.falling_at_goal(), program.within_limits()]
     table, room = sp.vstack([each.table for each in rows]), np.concatenate([each.room for each in rows])
     reach = np.stack([-program.reach, program.reach], axis=1)
     found = linprog(-program.gain(), table, np.maximum(room, 0), bounds=reach)  # no change is always a solution
-    if found.status != 0:
-        return None
-    try:
-        return leveled(program.changed(found.x), aims)
-    except (Refused, np.linalg.LinAlgError):
-        return None
+    insist(found.status == 0, "funnel", "the linear program was not solved")
+    return program.changed(found.x)
 
 
 class Rows(NamedTuple):

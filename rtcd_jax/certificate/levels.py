@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rtcd_jax.certificate.check import Refused
+from rtcd_jax.certificate.check import Refused, insist
 from rtcd_jax.certificate.loop import Loop
 
 LEVELS = 400
@@ -35,10 +35,16 @@ def directions(n: int) -> np.ndarray:
 
 
 def goal_level(loop: Loop, aims: np.ndarray) -> float:
-    """The largest level up to which V falls in the sampled directions [n D], under the limits on the states."""
-    levels = BOX_SHARE * loop.goal_box_level() * np.linspace(0, 1, LEVELS + 1)[1:]
-    falls = np.array([loop.goal_growth(level, aims) < 0 for level in levels])
-    return float(levels[-1] if falls.all() else levels[max(np.argmin(falls) - 1, 0)])
+    """The largest level up to which V falls in the sampled directions [n D], under the limits on the states.
+
+    Raises:
+        Refused: V falls at no level.
+    """
+    levels = BOX_SHARE * loop.goal_box_level() * np.linspace(0, 1, LEVELS + 1)
+    falls = [loop.goal_growth(level, aims) < 0 for level in levels[1:]]
+    last = falls.index(False) if False in falls else LEVELS
+    insist(last > 0, "goal", "V does not fall")
+    return float(levels[last])
 
 
 def carried_back(loop: Loop, k: int, start: float, end: float, rho: float, spare: float, aims: np.ndarray) -> Carried:
