@@ -4,7 +4,7 @@ import json
 import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any, NamedTuple, final
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -13,8 +13,9 @@ from rtcd_jax.certificate.check import Claim, Node, Witness
 from rtcd_jax.certificate.descent import SPARE, Descent, Front
 from rtcd_jax.certificate.goal import GoalRegion, goal_region
 from rtcd_jax.certificate.joint import largest
+from rtcd_jax.certificate.journal import Journal
 from rtcd_jax.certificate.loop import Loop, claim_of, double, doubles, sealed
-from rtcd_jax.files import replace, writing
+from rtcd_jax.files import replace
 from rtcd_jax.storage import read_elite
 
 RUNGS = ("certified", "proved")
@@ -50,28 +51,6 @@ class Outcome(NamedTuple):
     def whole(self) -> bool:
         """Whether the funnel reaches back to t = 0."""
         return self.start == 0.0
-
-
-@final
-class Journal:
-    """The finished steps of one elite's certificate, one JSON line each; the first line says of which claim and rung.
-
-    Lines of another claim or rung, and a torn last one, are dropped.
-    """
-
-    def __init__(self, path: Path, head: Mapping[str, Any]):
-        self.path = path
-        lines = []
-        if path.is_file():
-            with path.open("rb") as file:
-                lines = [json.loads(line) for line in file if line.endswith(b"\n")]
-        self.lines = lines[1:] if lines and lines[0] == head else []
-        replace(path, "".join(f"{json.dumps(line)}\n" for line in (head, *self.lines)).encode())
-
-    def append(self, line: Mapping[str, Any]) -> None:
-        self.lines.append(dict(line))
-        with writing(self.path), self.path.open("ab") as file:
-            file.write(f"{json.dumps(line)}\n".encode())
 
 
 def certify_elite(
@@ -131,7 +110,7 @@ def _finish(
     if rung == "proved":
         check.check(content)
     replace(path, (json.dumps(content, separators=(",", ":")) + "\n").encode())
-    journal.path.unlink()
+    journal.close()
     claim = check.read_claim(Node("claim", content["claim"]))
     pieces = [check.read_stretch(Node("funnel", each), claim) for each in content["funnel"]]
     axes = Node("goal.axes", content["goal"]["axes"]).array(claim.n, claim.n)
