@@ -8,17 +8,19 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from rtcd_jax.certificate import check
-from rtcd_jax.certificate.check import Claim, Node, Witness
+from rtcd_jax.certificate import backward, check, joint
+from rtcd_jax.certificate.check import Claim, Node, Refused, Witness
 from rtcd_jax.certificate.descent import SPARE, Descent, Front
 from rtcd_jax.certificate.goal import GoalRegion, goal_region
-from rtcd_jax.certificate.joint import largest
 from rtcd_jax.certificate.journal import Journal
+from rtcd_jax.certificate.levels import directions, leveled
 from rtcd_jax.certificate.loop import Loop, claim_of, double, doubles, sealed
 from rtcd_jax.files import replace
 from rtcd_jax.storage import read_elite
 
 RUNGS = ("certified", "proved")
+COARSER = 2
+"""One of so many directions is enough for funnels that are not proved yet."""
 
 
 class Step(NamedTuple):
@@ -58,7 +60,7 @@ def certify_elite(
 ) -> Outcome | None:
     """Writes `certificates/NAME.json` of a run folder; None if not even a goal region can be shown.
 
-    `optimize_value` frees the ellipsoids' shape where that is predicted to enlarge the funnel.
+    `optimize_value` chooses the ellipsoids' shapes so that the funnel is large.
 
     Raises:
         UserError: an elite that is not there, or of a plant that the checker does not know.
@@ -152,6 +154,16 @@ def _shaped(loop: Loop, journal: Journal) -> Loop:
     loop = largest(loop)
     journal.append({"values": loop.values.tolist(), "slopes": loop.slopes.tolist()})
     return loop
+
+
+def largest(loop: Loop) -> Loop:
+    """The loop with a value function whose funnel is larger, its level about 1; the same loop if it has no funnel."""
+    aims = directions(loop.n)[:, ::COARSER]
+    try:
+        funnel = leveled(loop, aims)
+    except Refused:
+        return loop
+    return joint.enlarged(funnel, aims) if loop.n == 2 else backward.grown(funnel, aims)
 
 
 def _front(descent: Descent, claim: Claim, outlet: float, journal: Journal) -> Front:

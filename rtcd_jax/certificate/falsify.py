@@ -84,9 +84,11 @@ class Part(NamedTuple):
     @classmethod
     def of(cls, seen: Seen) -> "Part":
         level, share, growth = seen.level, seen.share_of_limit, seen.growth
-        beyond = level[~(level <= 1)], share[~(share <= 1)], growth[~(growth <= 0)]
-        extremes = float(level.max()), float(share.max()), float(seen.error)
-        return cls(len(level), *extremes, *(each.tolist() for each in beyond), int(np.sum(~seen.arrived)))
+        levels, shares, growths = level[~(level <= 1)], share[~(share <= 1)], growth[~(growth <= 0)]
+        return cls(
+            len(level), float(level.max()), float(share.max()), float(seen.error),
+            levels.tolist(), shares.tolist(), growths.tolist(), int(np.sum(~seen.arrived)),
+        )  # fmt: skip
 
 
 def falsify_file(path: Path, rollouts: int, seed: int, workers: int, console: Console) -> bool:

@@ -21,15 +21,11 @@ import scipy.sparse as sp
 from scipy.optimize import linprog
 
 from rtcd_jax.certificate.check import Refused, insist
-from rtcd_jax.certificate.levels import carried_back, directions, goal_level
+from rtcd_jax.certificate.levels import INLET, SHARES, SPARED, directions, integral, leveled, merit, values_at
 from rtcd_jax.certificate.loop import Loop, hermite
 
-SHARES = np.linspace(0, 1, 5)
-"""Instants of an interval at which V' is asked for."""
 LEVELS = np.linspace(0.1, 1, 10)
 """Where it is asked for at the goal: |y|."""
-SPARED = 0.02
-"""Spare rate of V [1/s]."""
 TRUST = (0.3, 0.4, 0.01)
 """Largest change of an entry of P in units of the ellipsoid: at first, ever, and where the search ends."""
 BENDING = 4.0
@@ -38,28 +34,19 @@ ROUNDS = 40
 WIDEST = 3.0
 """Largest half width [rad] along the angle: beyond it polynomials follow the sine badly."""
 SHARE_OF_LIMIT = 0.99
-THINNED = {2: 8, 4: 4}
-"""By the number of states: the linear programs get one of so many directions,"""
-TRIED = {2: 2, 4: 4}
-"""and the levels that follow one of so many;"""
+THINNED = 8
+"""The linear programs get one of so many directions,"""
 KEPT = 40
 """and at every instant no more than so many, those where V falls least."""
 WORTH = 1e-3
 """What a step must gain, or the next one is shorter."""
-INLET = 0.1
-"""The logarithm of the inlet's volume counts so much beside that of the integral."""
 STEP = 0.01
 """Of the differences by which the loop's rate along a direction is found."""
 
 
-def largest(loop: Loop) -> Loop:
-    """The loop with the value function found, whose funnel has about the level 1; as it is, if it has no funnel yet."""
+def enlarged(best: Loop, aims: np.ndarray) -> Loop:
+    """The funnel after all steps that gained; `aims`: directions [n D] by which levels are carried back."""
     trust, most, finest = TRUST
-    aims = directions(loop.n)[:, :: TRIED[loop.n]]
-    try:
-        best = leveled(loop, aims)
-    except Refused:
-        return loop
     for _ in range(ROUNDS):
         tried = _step(best, trust, aims)
         gain = -np.inf if tried is None else merit(tried) - merit(best)
@@ -69,44 +56,6 @@ def largest(loop: Loop) -> Loop:
         if trust < finest:
             break
     return best
-
-
-def leveled(loop: Loop, aims: np.ndarray) -> Loop:
-    """The same shapes at the levels of a funnel, which become 1.
-
-    Raises:
-        Refused: the level vanishes, or V is not positive definite.
-    """
-    rho, n = goal_level(loop, aims), len(loop.u)
-    values, slopes = loop.values.copy(), loop.slopes.copy()
-    values[n] /= rho
-    for k in range(n - 1, -1, -1):
-        slopes[k, 1] /= rho
-        carried = carried_back(loop, k, 0.0, 1.0, rho, SPARED, aims)
-        slopes[k, 1] -= carried.last * values[k + 1]
-        rho = carried.rho
-        values[k] /= rho
-        slopes[k, 0] = slopes[k, 0] / rho - carried.first * values[k]
-    other = loop.shaped(values, slopes)
-    insist(np.linalg.eigvalsh(_values(other)[0]).min() > 0, "funnel", "S is not positive definite between knots")
-    return other
-
-
-def merit(loop: Loop) -> float:
-    """The logarithm of the funnel's integral over time, and a share of that of its inlet's volume."""
-    return float(np.log(integral(loop)) - INLET / 2 * np.linalg.slogdet(loop.values[0])[1])
-
-
-def integral(loop: Loop) -> float:
-    """Over time, of the volumes of {V <= 1}, up to the unit ball's."""
-    value, _ = _values(loop)
-    return float(np.trapezoid(np.linalg.det(value) ** -0.5, SHARES).sum() * loop.dt)
-
-
-def _values(loop: Loop) -> tuple[np.ndarray, np.ndarray]:
-    """P and P' [N T n n] at the instants of all N intervals."""
-    first, last = loop.slopes[:, None, 0], loop.slopes[:, None, 1]
-    return hermite(SHARES[:, None, None], loop.dt, loop.values[:-1, None], first, loop.values[1:, None], last)
 
 
 def _step(loop: Loop, trust: float, aims: np.ndarray) -> Loop | None:
@@ -150,7 +99,7 @@ class Program:
 
     def __init__(self, loop: Loop, trust: float):
         self.loop, knots, n = loop, np.arange(len(loop.u)), len(loop.u)
-        self.value, self.slope = _values(loop)
+        self.value, self.slope = values_at(loop)
         self.axes = np.linalg.cholesky(np.linalg.inv(self.value))
         self.units = np.linalg.inv(np.linalg.cholesky(np.linalg.inv(loop.values)))
         self.blocks = np.stack([knots, n + 1 + 2 * knots, knots + 1, n + 2 + 2 * knots], axis=1)
@@ -162,7 +111,7 @@ class Program:
 
     def falling(self) -> Rows:
         """V' <= -spare on the boundaries, in those directions where it falls least."""
-        error = self.axes @ directions(self.loop.n)[:, :: THINNED[self.loop.n]]
+        error = self.axes @ directions(self.loop.n)[:, ::THINNED]
         v, e, motion, stretch = _decrease(self.value, self.slope, error, self._error_rates)
         worst = np.argsort(-v, axis=-1)[..., :KEPT]
         v, stretch = np.take_along_axis(v, worst, -1), np.take_along_axis(stretch, worst, -1)
@@ -180,7 +129,7 @@ class Program:
 
     def falling_at_goal(self) -> Rows:
         """The same on ellipsoids within the last one, in the loop of the goal."""
-        value, unit, y = self.loop.values[-1], self.units[-1], directions(self.loop.n)[:, :: THINNED[self.loop.n]]
+        value, unit, y = self.loop.values[-1], self.units[-1], directions(self.loop.n)[:, ::THINNED]
         level = LEVELS[:, None, None]
         v, e, motion, stretch = _decrease(
             value, np.zeros_like(value), level * np.linalg.solve(unit, y), self._goal_rates

@@ -1,11 +1,11 @@
-"""Levels of V as the loop allows them: at the goal, and carried backward in time."""
+"""Levels of V as the loop allows them: at the goal, carried backward in time, and how large a funnel they make."""
 
 from typing import NamedTuple
 
 import numpy as np
 
 from rtcd_jax.certificate.check import Refused, insist
-from rtcd_jax.certificate.loop import Loop
+from rtcd_jax.certificate.loop import Loop, hermite
 
 LEVELS = 400
 """Levels at which the fastest growth of V at the goal is looked at."""
@@ -15,6 +15,12 @@ COLLAPSE = 1e-3
 BOX_SHARE = 0.999
 """Share of the level at which an ellipsoid would touch a limit."""
 DIRECTIONS = {2: 720, 4: 4000}
+SPARED = 0.02
+"""Spare rate [1/s] of funnels that are not proved yet."""
+SHARES = np.linspace(0, 1, 5)
+"""Instants of an interval at which such a funnel is looked at."""
+INLET = 0.1
+"""The logarithm of the inlet's volume counts so much beside that of the integral."""
 
 
 class Carried(NamedTuple):
@@ -71,3 +77,41 @@ def carried_back(loop: Loop, k: int, start: float, end: float, rho: float, spare
         both = float(np.log(held / cap) / ((end - start) * loop.dt))
         return Carried(cap, both, both)
     return Carried(float(rho), slope, last)
+
+
+def leveled(loop: Loop, aims: np.ndarray) -> Loop:
+    """The same shapes at the levels of a funnel, which become 1.
+
+    Raises:
+        Refused: the level vanishes, or V is not positive definite.
+    """
+    rho, n = goal_level(loop, aims), len(loop.u)
+    values, slopes = loop.values.copy(), loop.slopes.copy()
+    values[n] /= rho
+    for k in range(n - 1, -1, -1):
+        slopes[k, 1] /= rho
+        carried = carried_back(loop, k, 0.0, 1.0, rho, SPARED, aims)
+        slopes[k, 1] -= carried.last * values[k + 1]
+        rho = carried.rho
+        values[k] /= rho
+        slopes[k, 0] = slopes[k, 0] / rho - carried.first * values[k]
+    other = loop.shaped(values, slopes)
+    insist(np.linalg.eigvalsh(values_at(other)[0]).min() > 0, "funnel", "S is not positive definite between knots")
+    return other
+
+
+def merit(loop: Loop) -> float:
+    """The logarithm of the funnel's integral over time, and a share of that of its inlet's volume."""
+    return float(np.log(integral(loop)) - INLET / 2 * np.linalg.slogdet(loop.values[0])[1])
+
+
+def integral(loop: Loop) -> float:
+    """Over time, of the volumes of {V <= 1}, up to the unit ball's."""
+    value, _ = values_at(loop)
+    return float(np.trapezoid(np.linalg.det(value) ** -0.5, SHARES).sum() * loop.dt)
+
+
+def values_at(loop: Loop) -> tuple[np.ndarray, np.ndarray]:
+    """P and P' [N T n n] at the instants of all N intervals."""
+    first, last = loop.slopes[:, None, 0], loop.slopes[:, None, 1]
+    return hermite(SHARES[:, None, None], loop.dt, loop.values[:-1, None], first, loop.values[1:, None], last)
