@@ -12,7 +12,7 @@ PACKAGE = Path(__file__).parent.parent / "rtcd_jax"
 # From the bottom up; a module imports from its own layer and those below it. A folder stands for all its modules.
 LAYERS = (
     {"errors", "numerics", "files", "provenance", "backend"},
-    {"settings", "types", "console"},
+    {"settings", "types", "console", "workers"},
     {"config", "sweep"},
     {"plants"},
     {"problem"},
@@ -53,6 +53,7 @@ ALONE = {
     "numerics": {"numerics"},
     "errors": set(),
     "console": set(),
+    "workers": set(),
     "files": {"errors"},
     "cmaes": {"cmaes", "numerics", "errors"},
     "certificate.check": {"certificate.check"},

@@ -1,25 +1,26 @@
 """One elite's certificate: goal region, then funnel, every step kept on disk, so that a killed search goes on."""
 
-import contextlib
-import itertools
 import json
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any, NamedTuple, final
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from rtcd_jax.certificate import check
-from rtcd_jax.certificate.check import Claim, Node, Witness
-from rtcd_jax.certificate.descent import AIMS_SHARED, SPARE, Descent, Front, directions
-from rtcd_jax.certificate.flow import Aim, Plan, best_plan
+from rtcd_jax.certificate import backward, check, joint
+from rtcd_jax.certificate.check import Claim, Node, Refused, Witness
+from rtcd_jax.certificate.descent import SPARE, Descent, Front
 from rtcd_jax.certificate.goal import GoalRegion, goal_region
+from rtcd_jax.certificate.journal import Journal
+from rtcd_jax.certificate.levels import directions, leveled
 from rtcd_jax.certificate.loop import Loop, claim_of, double, doubles, sealed
-from rtcd_jax.files import replace, writing
+from rtcd_jax.files import replace
 from rtcd_jax.storage import read_elite
 
 RUNGS = ("certified", "proved")
+COARSER = 2
+"""One of so many directions is enough for funnels that are not proved yet."""
 
 
 class Step(NamedTuple):
@@ -54,38 +55,12 @@ class Outcome(NamedTuple):
         return self.start == 0.0
 
 
-@final
-class Journal:
-    """The finished steps of one elite's certificate, one JSON line each; the first line says of which claim and rung.
-
-    Lines of another claim or rung are dropped, and what follows a torn one.
-    """
-
-    def __init__(self, path: Path, head: Mapping[str, Any]):
-        self.path = path
-        lines = list(_whole(path)) if path.is_file() else []
-        self.lines = lines[1:] if lines and lines[0] == head else []
-        replace(path, "".join(f"{json.dumps(line)}\n" for line in (head, *self.lines)).encode())
-
-    def append(self, line: Mapping[str, Any]) -> None:
-        self.lines.append(dict(line))
-        with writing(self.path), self.path.open("ab") as file:
-            file.write(f"{json.dumps(line)}\n".encode())
-
-
-def _whole(path: Path) -> Iterator[dict[str, Any]]:
-    """A journal's lines up to the first one that is torn or damaged."""
-    with path.open("rb") as file, contextlib.suppress(TypeError, ValueError):
-        for line in itertools.takewhile(lambda line: line.endswith(b"\n"), file):
-            yield dict(json.loads(line))
-
-
 def certify_elite(
     run: Path, name: str, rung: str, on_step: Callable[[Step], None], optimize_value: bool = False
 ) -> Outcome | None:
     """Writes `certificates/NAME.json` of a run folder; None if not even a goal region can be shown.
 
-    `optimize_value` frees the ellipsoids' shape where that is predicted to enlarge the funnel.
+    `optimize_value` chooses the ellipsoids' shapes so that the funnel is large.
 
     Raises:
         UserError: an elite that is not there, or of a plant that the checker does not know.
@@ -98,11 +73,13 @@ def certify_elite(
     journal = Journal(
         folder / f".{name}.partial.jsonl", {"claim": check.seal(told), "rung": rung, "optimize_value": optimize_value}
     )
+    if optimize_value:
+        loop = _shaped(loop, journal)
     region = _region(claim, loop, exact, journal)
     if region is None:
         return None
     goal, outlet = region
-    descent = Descent(claim, loop, exact, _plan(loop, outlet, arrays, journal) if optimize_value else None)
+    descent = Descent(claim, loop, exact)
     front = _front(descent, claim, outlet, journal)
     for proved in descent.down_from(front):
         piece = proved.piece
@@ -135,7 +112,7 @@ def _finish(
     if rung == "proved":
         check.check(content)
     replace(path, (json.dumps(content, separators=(",", ":")) + "\n").encode())
-    journal.path.unlink()
+    journal.close()
     claim = check.read_claim(Node("claim", content["claim"]))
     pieces = [check.read_stretch(Node("funnel", each), claim) for each in content["funnel"]]
     axes = Node("goal.axes", content["goal"]["axes"]).array(claim.n, claim.n)
@@ -169,16 +146,24 @@ def _region(claim: Claim, loop: Loop, exact: bool, journal: Journal) -> tuple[di
     return goal, region.outlet
 
 
-def _plan(loop: Loop, outlet: float, arrays: Mapping[str, np.ndarray], journal: Journal) -> Plan | None:
-    """How the shape is freed, from the journal if it is there; None keeps the elite's S."""
+def _shaped(loop: Loop, journal: Journal) -> Loop:
+    """The loop with the value function that is optimized with the funnel, from the journal if it is there."""
     for line in journal.lines:
-        if "plan" in line:
-            return line["plan"] and Plan(Aim(*line["plan"][0]), line["plan"][1])
-    last, aims = len(loop.u) - 1, directions(loop.n)[:, ::AIMS_SHARED]
-    axes, _ = loop.axes(last, 1.0, outlet, 0.0)
-    plan = best_plan(loop, axes, np.asarray(arrays["rho"]), aims)
-    journal.append({"plan": plan})
-    return plan
+        if "values" in line:
+            return loop.shaped(np.array(line["values"]), np.array(line["slopes"]))
+    loop = largest(loop)
+    journal.append({"values": loop.values.tolist(), "slopes": loop.slopes.tolist()})
+    return loop
+
+
+def largest(loop: Loop) -> Loop:
+    """The loop with a value function whose funnel is larger, its level about 1; the same loop if it has no funnel."""
+    aims = directions(loop.n)[:, ::COARSER]
+    try:
+        funnel = leveled(loop, aims)
+    except Refused:
+        return loop
+    return joint.enlarged(funnel, aims) if loop.n == 2 else backward.grown(funnel, aims)
 
 
 def _front(descent: Descent, claim: Claim, outlet: float, journal: Journal) -> Front:

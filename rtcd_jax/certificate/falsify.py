@@ -3,18 +3,19 @@
 A proof that is right is not falsified; a prover, a checker and a model that share a mistake would be.
 """
 
-import multiprocessing
+import hashlib
 import time
-from collections.abc import Iterator
-from concurrent.futures import ProcessPoolExecutor
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple, final
 
 import numpy as np
 
+from rtcd_jax.certificate.journal import Journal
 from rtcd_jax.certificate.motions import REPEATED, Motions, Seen
 from rtcd_jax.console import Console
+from rtcd_jax.workers import processes
 
 CHUNK = 16384
 """Motions simulated together: their states stay in the processor's cache."""
@@ -52,36 +53,68 @@ class Found(NamedTuple):
 @final
 @dataclass(frozen=True)
 class Progress:
-    """`done` of `total` motions."""
+    """`done` of `total` motions, `before` of them by an earlier call."""
 
     done: int
     total: int
     level: float
     elapsed: float
+    before: int
 
     def __str__(self) -> str:
-        left = self.elapsed * (self.total / self.done - 1)
+        left = self.elapsed * (self.total - self.done) / (self.done - self.before)
         return (
             f"{self.done}/{self.total} motions  largest |y| {self.level:.9f}"
             f"  elapsed {self.elapsed:.0f} s  left {left:.0f} s"
         )
 
 
+class Part(NamedTuple):
+    """Of some motions: how many, the extremes, and what is beyond 1 or, in the goal region, grows."""
+
+    rollouts: int
+    level: float
+    share_of_limit: float
+    error: float
+    levels: list[float]
+    shares: list[float]
+    growths: list[float]
+    not_arrived: int
+
+    @classmethod
+    def of(cls, seen: Seen) -> "Part":
+        level, share, growth = seen.level, seen.share_of_limit, seen.growth
+        levels, shares, growths = level[~(level <= 1)], share[~(share <= 1)], growth[~(growth <= 0)]
+        return cls(
+            len(level), float(level.max()), float(share.max()), float(seen.error),
+            levels.tolist(), shares.tolist(), growths.tolist(), int(np.sum(~seen.arrived)),
+        )  # fmt: skip
+
+
 def falsify_file(path: Path, rollouts: int, seed: int, workers: int, console: Console) -> bool:
     """Simulates `rollouts` motions of a certificate; True if none broke it. The workers' number changes nothing.
 
+    What was finished before a kill is kept beside the certificate, and is not done again.
+
     Raises:
-        UserError: no certificate.
+        UserError: no certificate, or a folder that cannot be written.
     """
     motions = Motions.of(path)
+    digest = hashlib.sha256(path.read_bytes()).hexdigest()
+    journal = Journal(
+        path.with_name(f".{path.stem}.falsify.jsonl"), {"certificate": digest, "rollouts": rollouts, "seed": seed}
+    )
     steps = enough_steps(motions, seed)
-    began, seen, done = time.monotonic(), [], 0
-    for each in _chunks(path, rollouts, seed, steps, workers):
-        seen.append(each)
-        done += len(each.level)
-        level = max(float(one.level.max()) for one in seen)
-        console.progress(Progress(done, rollouts, level, time.monotonic() - began))
-    found = summed(seen, steps)
+    began, kept = time.monotonic(), len(journal.lines)
+    parts = [Part(**line) for line in journal.lines]
+    for part in _parts(path, rollouts, seed, steps, workers, kept):
+        journal.append(part._asdict())
+        parts.append(part)
+        done, before = sum(each.rollouts for each in parts), sum(each.rollouts for each in parts[:kept])
+        level = max(each.level for each in parts)
+        console.progress(Progress(done, rollouts, level, time.monotonic() - began, before))
+    journal.close()
+    found = summed(parts, steps)
     console.message(sentence(motions, found))
     return found.broken == 0
 
@@ -94,14 +127,14 @@ def enough_steps(motions: Motions, seed: int) -> int:
     return steps
 
 
-def _chunks(path: Path, rollouts: int, seed: int, steps: int, workers: int) -> Iterator[Seen]:
-    sizes = [min(CHUNK, rollouts - start) for start in range(0, rollouts, CHUNK)]
-    context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(min(workers, len(sizes)), context, _remember, (path,)) as pool:
-        try:
-            yield from pool.map(_work, sizes, [(seed, i) for i in range(len(sizes))], [steps] * len(sizes))
-        finally:
-            pool.shutdown(wait=False, cancel_futures=True)
+def _parts(path: Path, rollouts: int, seed: int, steps: int, workers: int, kept: int) -> Iterator[Part]:
+    """The parts in their order, from the first one that is not kept."""
+    sizes = [min(CHUNK, rollouts - start) for start in range(0, rollouts, CHUNK)][kept:]
+    if not sizes:
+        return
+    with processes(min(workers, len(sizes)), _remember, path) as pool:
+        seeds = [(seed, kept + i) for i in range(len(sizes))]
+        yield from pool.map(_work, sizes, seeds, [steps] * len(sizes))
 
 
 _motions: Motions
@@ -113,24 +146,27 @@ def _remember(path: Path) -> None:
     _motions = Motions.of(path)
 
 
-def _work(count: int, seed: tuple[int, int], steps: int) -> Seen:
-    return _motions.follow(count, steps, np.random.default_rng(seed))
+def _work(count: int, seed: tuple[int, int], steps: int) -> Part:
+    return Part.of(_motions.follow(count, steps, np.random.default_rng(seed)))
 
 
-def summed(seen: list[Seen], steps: int) -> Found:
-    """All chunks together."""
-    error = max(each.error for each in seen)
+def summed(parts: list[Part], steps: int) -> Found:
+    """All parts together."""
+    error = max(each.error for each in parts)
     allowance = 2 * error + ROUNDING
-    level, share, growth, arrived = (np.concatenate(each) for each in zip(*(s[:4] for s in seen), strict=True))
+
+    def beyond(values: Iterable[list[float]], bound: float) -> int:
+        return sum(not value <= bound + allowance for each in values for value in each)
+
     return Found(
-        rollouts=len(level),
+        rollouts=sum(each.rollouts for each in parts),
         steps=steps,
-        left_funnel=int(np.sum(~(level <= 1 + allowance))),
-        left_limits=int(np.sum(~(share <= 1 + allowance))),
-        moved_away=int(np.sum(~(growth <= allowance))),
-        not_arrived=int(np.sum(~arrived)),
-        level=float(level.max()),
-        share_of_limit=float(share.max()),
+        left_funnel=beyond((each.levels for each in parts), 1),
+        left_limits=beyond((each.shares for each in parts), 1),
+        moved_away=beyond((each.growths for each in parts), 0),
+        not_arrived=sum(each.not_arrived for each in parts),
+        level=max(each.level for each in parts),
+        share_of_limit=max(each.share_of_limit for each in parts),
         error=error,
         allowance=allowance,
     )

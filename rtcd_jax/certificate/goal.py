@@ -6,11 +6,10 @@ import numpy as np
 
 from rtcd_jax.certificate import check
 from rtcd_jax.certificate.check import Claim, Q, Refused, Shell
-from rtcd_jax.certificate.descent import BOX_SHARE, directions, on_grid, prove
+from rtcd_jax.certificate.descent import on_grid, prove
+from rtcd_jax.certificate.levels import directions, goal_level
 from rtcd_jax.certificate.loop import Loop
 
-LEVELS = 400
-"""Levels at which the fastest growth of V is looked at before anything is proved."""
 LADDER = (1.0, 0.995, 0.985, 0.97, 0.95, 0.92, 0.88, 0.83, 0.77, 0.7, 0.6, 0.5, 0.35, 0.2, 0.1)
 """Shares of the level that the samples allow, in the order of trial."""
 ROOM = 1e-3
@@ -34,13 +33,13 @@ class GoalRegion(NamedTuple):
 
 def goal_region(claim: Claim, loop: Loop, exact: bool) -> GoalRegion | None:
     """The first level of the ladder that goes through; None if none does."""
-    top = BOX_SHARE * loop.goal_box_level()
     aims = directions(claim.n)
-    levels = top * np.linspace(0, 1, LEVELS + 1)[1:]
-    falls = np.array([loop.goal_growth(level, aims) < 0 for level in levels])
-    most = levels[-1] if falls.all() else levels[max(np.argmin(falls) - 1, 0)]
+    try:
+        most = goal_level(loop, aims)
+    except Refused:
+        return None
     for share in LADDER:
-        found = _at_level(claim, loop, float(share * most), exact, aims)
+        found = _at_level(claim, loop, share * most, exact, aims)
         if found is not None:
             return found
     return None

@@ -1,6 +1,7 @@
 """An elite as a certificate sees it: the claim of its closed loop, and the same loop in float64 to search with."""
 
 from collections.abc import Callable, Mapping
+from copy import copy
 from typing import Any, final
 
 import numpy as np
@@ -81,7 +82,8 @@ def linear(
 class Loop:
     """The claimed loop in float64, and the value function that shapes its funnel.
 
-    Between knots S is the cubic Hermite interpolant of S_k with the slopes of the policy's Riccati equation.
+    Between knots S is the cubic Hermite interpolant of S_k with the slopes of the policy's Riccati equation, unless
+    it is `shaped` anew.
     """
 
     def __init__(self, claim: check.Claim, arrays: Mapping[str, np.ndarray], policy: Mapping[str, float] | None = None):
@@ -100,14 +102,20 @@ class Loop:
         q, r = np.asarray(arrays["Q"]), told.get("input_weight", 1.0) * float(arrays["R"][0, 0])
         left = np.maximum(1 - np.abs(self.u) / self.limit, told.get("authority", 1.0))
         shift = told.get("discount", 0.0) * np.eye(self.n)
-        self._slopes = np.zeros((len(self.u), 2, self.n, self.n))
+        self.slopes = np.zeros((len(self.u), 2, self.n, self.n))
         for k, u in enumerate(self.u):
             for end in (0, 1):
                 a, b = linear(self.plant, self.parameters, self.x[k + end], u)
-                self._slopes[k, end] = riccati(self.values[k + end], a + shift, b, q, left[k] ** 2 / r)
+                self.slopes[k, end] = riccati(self.values[k + end], a + shift, b, q, left[k] ** 2 / r)
 
     def rate(self, x: np.ndarray, u: Any) -> np.ndarray:
         return rate(self.plant, self.parameters, x, u)
+
+    def shaped(self, values: np.ndarray, slopes: np.ndarray) -> "Loop":
+        """The same loop with another V: S at the knots [N+1 n n] and S' at both ends of the intervals [N 2 n n]."""
+        other = copy(self)
+        other.values, other.slopes = values, slopes
+        return other
 
     def nominal(self, k: int, share: float) -> tuple[np.ndarray, np.ndarray]:
         """x* and x*' at a share of the interval k."""
@@ -115,7 +123,7 @@ class Loop:
 
     def value(self, k: int, share: float) -> tuple[np.ndarray, np.ndarray]:
         """S and S'."""
-        return hermite(share, self.dt, self.values[k], self._slopes[k, 0], self.values[k + 1], self._slopes[k, 1])
+        return hermite(share, self.dt, self.values[k], self.slopes[k, 0], self.values[k + 1], self.slopes[k, 1])
 
     def axes(self, k: int, share: float, rho: float, growth: float) -> tuple[np.ndarray, np.ndarray]:
         """L with L L' = rho S^-1 and its rate, where rho' = growth rho; the angle's row has its first entry alone.

@@ -2,12 +2,11 @@
 
 import contextlib
 import io
-import multiprocessing
 import os
 import queue
 import time
 from collections.abc import Iterator, Sequence
-from concurrent.futures import Future, ProcessPoolExecutor
+from concurrent.futures import Future
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, final
@@ -21,6 +20,7 @@ from rtcd_jax.certificate.elite import Outcome, Step, certify_elite
 from rtcd_jax.console import Console
 from rtcd_jax.files import replace_json, writing
 from rtcd_jax.storage import require_elites
+from rtcd_jax.workers import CONTEXT, processes
 
 POLL = 0.2
 """Seconds between looks at the workers' progress."""
@@ -90,19 +90,14 @@ def _events(
     # One thread each: there is a worker for every core, and small matrices in many threads cost ten times as much.
     for library in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
         os.environ.setdefault(library, "1")
-    context = multiprocessing.get_context("spawn")
-    steps = context.Queue()
-    pool = ProcessPoolExecutor(min(workers, len(names)), context, _remember, (steps,))
-    with pool:
+    steps = CONTEXT.Queue()
+    with processes(min(workers, len(names)), _remember, steps) as pool:
         waiting: dict[Future, str] = {pool.submit(_work, folder, name, rung, optimize_value): name for name in names}
-        try:
-            while waiting:
-                with contextlib.suppress(queue.Empty):
-                    yield steps.get(timeout=POLL)
-                for future in [future for future in waiting if future.done()]:
-                    yield waiting.pop(future), future.result()
-        finally:
-            pool.shutdown(wait=False, cancel_futures=True)
+        while waiting:
+            with contextlib.suppress(queue.Empty):
+                yield steps.get(timeout=POLL)
+            for future in [future for future in waiting if future.done()]:
+                yield waiting.pop(future), future.result()
 
 
 _steps: Any = None

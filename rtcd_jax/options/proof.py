@@ -25,7 +25,7 @@ class CertifyOptions:
     run: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RUN", help="the run folder")]
     elites: Annotated[int, tyro.conf.arg(help="how many, the best first [-] (>= 1)")] = 1
     rung: Annotated[Literal["certified", "proved"], tyro.conf.arg(help="how much is to be shown")] = "proved"
-    optimize_value: Annotated[bool, tyro.conf.arg(help="free the ellipsoids' shape where that enlarges it")] = False
+    optimize_value: Annotated[bool, tyro.conf.arg(help="choose the ellipsoids' shapes too")] = False
     workers: Annotated[int, tyro.conf.arg(help="processes, one elite each; 0 for one a core [-] (>= 0)")] = 0
 
 
@@ -34,7 +34,7 @@ class FalsifyOptions:
     """Simulate motions from the boundary and the inside of what a certificate says is proved, at instants all over it.
 
     Equations and integrator share nothing with the proof. Exit code 1 if a motion leaves the funnel, a limit or the
-    goal region, beyond the integrator's own error, which is measured.
+    goal region, beyond the integrator's own error, which is measured. The same command goes on after a kill.
 
     Example: rtcd falsify checkpoints/pendulum_rtcd/certificates/000.json --rollouts 100000
     """

@@ -4,10 +4,9 @@ import contextlib
 import functools
 import hashlib
 import io
-import multiprocessing
 import time
 from collections.abc import Iterator, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures import as_completed
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import NamedTuple, final
@@ -24,6 +23,7 @@ from rtcd_jax.storage import read_elite, require_elites
 from rtcd_jax.verify.elite import Elite
 from rtcd_jax.verify.simulate import Outcome
 from rtcd_jax.verify.verification import Trial, Verification
+from rtcd_jax.workers import processes
 
 PLACES = {"000": "elites", "initial": ""}
 """Which funnels of a run are verified, and where in its folder they are."""
@@ -129,13 +129,10 @@ def _done(jobs: Sequence[Job], workers: int) -> Iterator[tuple[Job, Outcome]]:
     if min(workers, len(jobs)) <= 1:
         yield from ((job, _do(job)) for job in jobs)
         return
-    with ProcessPoolExecutor(min(workers, len(jobs)), multiprocessing.get_context("spawn")) as pool:
+    with processes(min(workers, len(jobs))) as pool:
         waiting = {pool.submit(_do, job): job for job in jobs}
-        try:
-            for future in as_completed(waiting):
-                yield waiting[future], future.result()
-        finally:
-            pool.shutdown(wait=False, cancel_futures=True)
+        for future in as_completed(waiting):
+            yield waiting[future], future.result()
 
 
 def _do(job: Job) -> Outcome:

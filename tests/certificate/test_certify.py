@@ -1,14 +1,12 @@
 """From a run folder to certificates: stored step by step, resumed after a kill, told in a table."""
 
-import itertools
 import json
 
 import numpy as np
 import pytest
-from scipy.linalg import expm
 
 from rtcd_jax import cli
-from rtcd_jax.certificate import check, descent, elite, flow
+from rtcd_jax.certificate import check, descent, elite
 from rtcd_jax.certificate.loop import Loop, claim_of, double, sealed
 from rtcd_jax.certificate.run import certify_run, rank_correlation
 from rtcd_jax.errors import UserError
@@ -120,22 +118,24 @@ class Killed(Exception):
     pass
 
 
-def test_a_killed_search_goes_on_to_the_same_certificate(run, tmp_path):
-    killed = folder_of(tmp_path)
+@pytest.mark.parametrize("optimized", [False, True])
+def test_a_killed_search_goes_on_to_the_same_certificate(tmp_path, optimized):
+    whole, killed = folder_of(tmp_path / "whole"), folder_of(tmp_path / "killed")
+    elite.certify_elite(whole, "000", "proved", lambda step: None, optimized)
 
     def stop(step):
         if step.knot == 2:
             raise Killed
 
     with pytest.raises(Killed):
-        elite.certify_elite(killed, "000", "proved", stop)
+        elite.certify_elite(killed, "000", "proved", stop, optimized)
     journal = killed / "certificates" / ".000.partial.jsonl"
     with journal.open("ab") as file:
         file.write(b'{"stretch": {"torn')
     seen = []
-    elite.certify_elite(killed, "000", "proved", lambda step: seen.append(step.knot))
+    elite.certify_elite(killed, "000", "proved", lambda step: seen.append(step.knot), optimized)
     assert seen == [1, 0]
-    assert (killed / "certificates" / "000.json").read_bytes() == (run / "certificates" / "000.json").read_bytes()
+    assert (killed / "certificates" / "000.json").read_bytes() == (whole / "certificates" / "000.json").read_bytes()
 
 
 def test_another_elite_s_journal_is_not_used(tmp_path):
@@ -174,90 +174,3 @@ def test_ranks_of_sampled_and_proved_sums():
     turned = [outcome(1.0, 30.0), outcome(2.0, 20.0), outcome(3.0, 10.0)]
     assert rank_correlation(alike) == pytest.approx(1)
     assert rank_correlation(turned) == pytest.approx(-1)
-
-
-def test_attraction_weighs_the_narrow_directions():
-    """G^-a with trace n: none at 0; the more, the more the largest level set of V inside the ellipsoid counts."""
-    g = np.array([[4.0, 1.0], [1.0, 0.5]])
-    np.testing.assert_allclose(flow._importance(g, 0.0), np.eye(2), atol=1e-12)
-    inverse = np.linalg.inv(g)
-    np.testing.assert_allclose(flow._importance(g, 1.0), 2 * inverse / np.trace(inverse), rtol=1e-12)
-    least = np.linalg.eigh(g)[1][:, 0]
-    np.testing.assert_allclose(flow._importance(g, 40.0), 2 * np.outer(least, least), atol=1e-9)
-
-
-def test_level_sets_take_over_from_free_shapes_inside_them():
-    """Before the plan's knot L L' is a multiple of S^-1 again, and every interval is accepted by the checker."""
-    arrays, record = swing.elite()
-    claim = claimed(arrays, record)
-    loop = Loop(claim, arrays)
-    search = descent.Descent(claim, loop, exact=True, plan=flow.Plan(flow.Aim(0.3, 0.0), 2))
-    pieces = [each.piece for each in search.down_from(search.outlet(15.0))][::-1]
-    assert (pieces[0].knot, pieces[0].start) == (0, 0)
-    for before, after in itertools.pairwise(pieces):
-        assert before.last == after.first
-    for piece in pieces:
-        axes = np.array([[float(c) for c in row] for row in piece.first])
-        round_ = axes.T @ loop.value(piece.knot, float(piece.start))[0] @ axes
-        is_level_set = np.allclose(round_, round_[0, 0] * np.eye(2), rtol=1e-6, atol=1e-6 * round_[0, 0])
-        assert is_level_set == (piece.knot < 2)
-    axes = np.array([[float(c) for c in row] for row in pieces[-1].first])
-    held = flow.held_level(arrays["S"][3], axes)
-    y = np.linalg.inv(axes) @ np.linalg.cholesky(np.linalg.inv(arrays["S"][3]) * held) @ descent.directions(2)
-    assert np.linalg.norm(y, axis=0).max() == pytest.approx(1, abs=1e-4)
-
-
-def test_a_plan_switches_where_it_gains_most(monkeypatch):
-    """Free shapes as far as what they hold of the usual levels is worth it; a tenth of the inlet may be lost."""
-    arrays, record = swing.elite()
-    loop, rho = Loop(claimed(arrays, record), arrays), np.full(5, 4.0)
-    usual = 4.0 / np.sqrt(np.linalg.det(arrays["S"]))
-    volumes = usual * np.array([0.4, 2.0, 3.0, 3.0, 1.0])
-    levels = np.array([1.0, 4.1, 3.9, 5.0, 4.0])
-
-    def predicted(loop, axes, aim, y):
-        return (volumes, levels) if aim == flow.AIMS[1] else (volumes[-1:], levels[-1:])
-
-    monkeypatch.setattr(flow, "predicted", predicted)
-    assert flow.best_plan(loop, np.eye(2), rho, None) == flow.Plan(flow.AIMS[1], 1)
-    levels[1] = 3.7
-    assert flow.best_plan(loop, np.eye(2), rho, None) == flow.Plan(flow.AIMS[1], 1)
-    levels[1] = 3.5
-    assert flow.best_plan(loop, np.eye(2), rho, None) == flow.Plan(flow.AIMS[1], 2)
-    volumes[0] = 0.95 * usual[0]
-    assert flow.best_plan(loop, np.eye(2), rho, None) == flow.Plan(flow.AIMS[1], 0)
-    volumes[:] = usual
-    assert flow.best_plan(loop, np.eye(2), rho, None) is None
-
-
-@pytest.mark.slow
-def test_ellipsoids_of_free_shape_are_larger(tmp_path):
-    """Where S is not TVLQR's but a poor one, freeing the shape gives more than the proof with that S."""
-    arrays, _ = swing.elite()
-    slim = np.array([[4.0, 0.0], [0.0, 0.5]])
-    values = arrays["S"].copy()
-    values[:-1] = slim @ values[:-1] @ slim
-    rho = np.full(5, 4.0)
-    sums = []
-    for freed in (False, True):
-        run = folder_of(tmp_path / str(freed), S=values, rho=rho)
-        outcome = elite.certify_elite(run, "000", "proved", lambda step: None, optimize_value=freed)
-        sums.append(outcome.found["sum"])
-        assert check.check_file(run / "certificates" / "000.json").volumes == outcome.found
-    assert sums[1] > 1.2 * sums[0]
-
-
-def test_free_shapes_obey_the_sampled_inequality():
-    """y'W y >= g on the sphere, and the trace is the least: the Riccati equation's own W has a larger one."""
-    arrays, record = swing.elite()
-    claim = claimed(arrays, record)
-    loop, aims = Loop(claim, arrays), descent.directions(2)[:, ::4]
-    axes, _ = loop.axes(2, 1.0, 3.0, 0.0)
-    w = flow.fastest_growth(loop, 2, 0.0, 1.0, axes, 0.1, flow.Aim(0.0, 0.0), aims)
-    for share in (0.0, 0.5, 1.0):
-        here = axes @ expm(-w * (1 - share) * loop.dt)
-        growth = np.sum(aims * (w @ aims), axis=0) - loop.drift(2, share, here, aims)
-        assert growth.min() > 0.05
-    usual = loop.growth(2, 1.0, 3.0, aims)
-    _, rates = loop.axes(2, 1.0, 3.0, usual)
-    assert np.trace(w) < np.trace(np.linalg.solve(axes, rates)) + 2 * 0.1

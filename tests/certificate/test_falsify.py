@@ -8,7 +8,8 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from rtcd_jax import cli
-from rtcd_jax.certificate.falsify import TOLERANCE, enough_steps, summed
+from rtcd_jax.certificate import falsify
+from rtcd_jax.certificate.falsify import TOLERANCE, Part, enough_steps, falsify_file, summed
 from rtcd_jax.certificate.motions import Motions
 from tests.certificate import swing
 from tests.certificate.loops import floats
@@ -22,7 +23,7 @@ def random():
 def test_what_is_proved_is_not_falsified(content):
     motions = Motions(content)
     steps = enough_steps(motions, seed=0)
-    found = summed([motions.follow(600, steps, random())], steps)
+    found = summed([Part.of(motions.follow(600, steps, random()))], steps)
     assert found.broken == 0
     assert found.rollouts == 600
     assert 0.999 < found.level < 1
@@ -45,7 +46,7 @@ def test_what_is_wrong_is_falsified(content, claim):
     wrong = copy.deepcopy(content)
     where = container(wrong)
     where[key] = nudged(where[key], share)
-    assert getattr(summed([Motions(resealed(wrong)).follow(300, 8, random())], 8), broken) > 0
+    assert getattr(summed([Part.of(Motions(resealed(wrong)).follow(300, 8, random()))], 8), broken) > 0
 
 
 def test_motions_are_those_of_an_outside_integrator(content):
@@ -90,6 +91,39 @@ def test_the_command_line(run, tmp_path, capsys):
     file.write_text(json.dumps(wrong))
     assert cli.main(["falsify", str(file), "--rollouts", "200"]) == 2
     assert "was changed: its digest is another" in capsys.readouterr().err
+
+
+class Killed(Exception):
+    pass
+
+
+class Stopped:
+    """A console that is killed after so many reports of progress."""
+
+    def __init__(self, after=None):
+        self.after, self.done, self.lines = after, [], []
+
+    def message(self, text):
+        self.lines.append(text)
+
+    def progress(self, now):
+        self.done.append(now.done)
+        if len(self.done) == self.after:
+            raise Killed
+
+
+def test_a_killed_falsification_goes_on(run, tmp_path, monkeypatch):
+    monkeypatch.setattr(falsify, "CHUNK", 64)
+    file = tmp_path / "000.json"
+    file.write_bytes((run / "certificates" / "000.json").read_bytes())
+    whole, killed, resumed = Stopped(), Stopped(after=2), Stopped()
+    assert falsify_file(file, 200, 0, 1, whole)
+    with pytest.raises(Killed):
+        falsify_file(file, 200, 0, 1, killed)
+    assert falsify_file(file, 200, 0, 1, resumed)
+    assert (whole.done, resumed.done) == ([64, 128, 192, 200], [192, 200])
+    assert resumed.lines == whole.lines
+    assert [path.name for path in tmp_path.iterdir()] == ["000.json"]
 
 
 @pytest.mark.parametrize(

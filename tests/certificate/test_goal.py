@@ -32,7 +32,8 @@ class Upright:
         }  # fmt: skip
         told = claim_of(arrays, {"plant": "pendulum", "parameters": parameters, "state_limits": [None, None]})
         claim = check.read_claim(check.Node("claim", sealed({**told, "start": [0, double(0.0)]})))
-        region = goal_region(claim, Loop(claim, arrays), exact=True)
+        self.claim, self.loop = claim, Loop(claim, arrays)
+        region = goal_region(claim, self.loop, exact=True)
         assert region is not None
         self.rho = region.rho
 
