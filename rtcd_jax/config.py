@@ -121,14 +121,7 @@ Variables = Annotated[tuple[Variable, ...], Field(strict=False)]
 class TaskConfig(Settings):
     start: Numbers = Field(description=f"first state of the nominal motion, pinned [{UNIT}]")
     goal: Numbers = Field(description=f"last state of the nominal motion, pinned, an equilibrium [{UNIT}]")
-    state_limits: Limits = Field(
-        description=f"largest |x_i|, .inf for none, not all; leaving them is a failure [{UNIT}]"
-    )
-
-    def problems(self) -> Iterator[Problem]:
-        limits = self.state_limits
-        if limits and all(limit == float("inf") for limit in limits):
-            yield Problem(("state_limits",), "one must be finite: funnels are looked for inside them", limits)
+    state_limits: Limits = Field(description=f"largest |x_i|, .inf for none; leaving them is a failure [{UNIT}]")
 
 
 class WeightsConfig(Settings):

@@ -18,13 +18,17 @@ import numpy as np
 from rtcd_jax import rollout
 from rtcd_jax.confirmation import Effort, confirm, follow
 from rtcd_jax.numerics import sampling
+from rtcd_jax.numerics.batched import solve_lower
 from rtcd_jax.numerics.ellipsoid import Ellipsoids
 from rtcd_jax.numerics.sphere import climb
 from rtcd_jax.problem import Problem
 from rtcd_jax.types import Candidate, Funnel, Policy, Status, first_failure
 
 SMALLEST = 1e-3
-"""Radius over the box's below which a set counts as empty: a millionth of its level."""
+"""Radius below which a set counts as empty, over the box's or that at which the goal's LQR saturates."""
+
+REACH = 1e3
+"""Radius up to which sets are looked for, over that at which the goal's LQR saturates: states may have no limits."""
 
 WINDOWS = (2.0, 1.1)
 RADII = 3
@@ -47,6 +51,8 @@ def estimate_funnel(problem: Problem, candidate: Candidate, policy: Policy, key,
     keys = jax.random.split(key, 4)
     sets = Ellipsoids.about(policy.trajectory.xs.T, jnp.moveaxis(policy.values, 0, -1))
     boxes = sets.radii_inside(jnp.asarray(problem.state_limits, sets.centers.dtype))
+    saturated = _saturating_radius(problem, policy, sets.part(slice(-1, None)))
+    boxes = jnp.minimum(boxes, REACH * saturated)
     tracked = rollout.reference(problem, candidate, policy, effort.funnel.steps)
     last = _goal_level(problem, candidate, policy, sets.part(slice(-1, None)), boxes[-1], keys[0], effort)
 
@@ -54,7 +60,7 @@ def estimate_funnel(problem: Problem, candidate: Candidate, policy: Policy, key,
     levels, trials = confirm(problem, candidate, sets, tracked, levels, keys[2], effort)
     if effort.follow:
         levels, trials = follow(problem, candidate, policy, sets, tracked, levels, keys[3], effort)
-    full = jnp.all(levels >= (boxes * SMALLEST) ** 2) & jnp.all(boxes > 0)
+    full = jnp.all(levels >= (jnp.minimum(boxes, saturated) * SMALLEST) ** 2) & jnp.all(boxes > 0)
     finite = jnp.all(jnp.isfinite(levels)) & jnp.all(jnp.isfinite(policy.values))
     status = first_failure(
         policy.status,
@@ -132,6 +138,13 @@ class _Step(NamedTuple):
     def ends_alone(self, radii, y):
         """The ends under the plant's own equations."""
         return self.ends(radii, y, rollout.closed_form(self.problem.plant))[0]
+
+
+def _saturating_radius(problem, policy, goal_set: Ellipsoids):
+    """The radius of the goal's set at which an input of the goal's LQR reaches its limit."""
+    rows = solve_lower(goal_set.factors, policy.gains[-1].T[..., None])  # u = -K L'^-1 y
+    largest = jnp.sqrt(jnp.sum(rows**2, 0))[:, 0]
+    return jnp.min(jnp.asarray(problem.input_limits, largest.dtype) / largest)
 
 
 def _goal_level(problem, candidate, policy, goal_set: Ellipsoids, box, key, effort: Effort):

@@ -224,6 +224,14 @@ def test_the_first_failure_is_kept(status):
     assert _boxed()(_with(failed, values=jnp.nan * failed.values)).status == status
 
 
+@pytest.mark.parametrize("limits", [(np.inf, np.inf), (np.inf, 20), (1e4, 1e4), (1e6, 1e6)])
+def test_without_limits_a_funnel_is_that_within_limits_that_never_bind(limits):
+    """Of a saturated robot, whose input alone bounds the goal's region."""
+    near, far = (_estimator(linear.problem_of(box, limit=1.0))(RESTING) for box in ((1.0, 3.0), limits))
+    assert far.status == Status.OK
+    np.testing.assert_allclose(far.levels, near.levels, rtol=0.02)
+
+
 # ---- the pendulum
 
 
