@@ -7,5 +7,7 @@ set -euo pipefail
 export JAX_COMPILATION_CACHE_DIR="${JAX_COMPILATION_CACHE_DIR:-$PWD/.jax_cache}"
 export JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS=0
 export JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES=-1
-nohup "${RTCD:-rtcd}" optimize "$@" >>rtcd.log 2>&1 </dev/null &
+rtcd=${RTCD:-$(command -v rtcd || echo .venv/bin/rtcd)}
+command -v "$rtcd" >/dev/null || { echo "no $rtcd here: \`make run\` in the repository's root makes it" >&2; exit 2; }
+nohup "$rtcd" optimize "$@" >>rtcd.log 2>&1 </dev/null &
 echo "process $!, output in rtcd.log"

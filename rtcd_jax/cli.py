@@ -8,6 +8,7 @@ Nothing heavy is imported before the input is known to be right.
 import os
 import sys
 from collections.abc import Callable, Sequence
+from concurrent.futures import BrokenExecutor
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -124,6 +125,7 @@ def verify(arguments: Sequence[str]) -> int:
 
     with Console() as console:
         held = verify_run(options.run, options.states, options.seed, options.workers or cores(), console)
+        _refresh(options.run, console)
     return OK if held else BROKEN_PROMISE
 
 
@@ -137,6 +139,19 @@ def report(arguments: Sequence[str]) -> int:
     page, *figures = write_report(options.runs, options.to)
     print(f"{page}, and {len(figures)} figures in {figures[0].parent}")
     return OK
+
+
+def _refresh(run: Path, console: Any) -> None:
+    """Brings the run's page up to date, if it has one. The verb's own results are stored already: no error ends it."""
+    from rtcd_jax.report import refresh
+
+    try:
+        page = refresh(run)
+    except UserError as error:
+        console.message(f"{run / 'report.html'} does not show this yet: {error}")
+    else:
+        if page:
+            console.message(f"{page} shows this, too")
 
 
 def animate(arguments: Sequence[str]) -> int:
@@ -175,7 +190,9 @@ def certify(arguments: Sequence[str]) -> int:
     from rtcd_jax.console import Console
 
     with Console() as console:
-        whole = certify_run(options.run, options.elites, options.rung, options.workers, console, options.optimize_value)
+        workers = options.workers or cores()
+        whole = certify_run(options.run, options.elites, options.rung, workers, console, options.optimize_value)
+        _refresh(options.run, console)
     return OK if whole else BROKEN_PROMISE
 
 
@@ -204,6 +221,7 @@ def disturb(arguments: Sequence[str]) -> int:
 
     with Console() as console:
         disturb_run(options.run, options.states, options.seed, console)
+        _refresh(options.run, console)
     return OK
 
 
@@ -223,7 +241,7 @@ def falsify(arguments: Sequence[str]) -> int:
     from rtcd_jax.console import Console
 
     with Console() as console:
-        held = falsify_file(options.certificate, options.rollouts, options.seed, options.workers, console)
+        held = falsify_file(options.certificate, options.rollouts, options.seed, options.workers or cores(), console)
     return OK if held else BROKEN_PROMISE
 
 
@@ -276,6 +294,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except UserError as error:
         print(f"rtcd: {error}", file=sys.stderr)
         return WRONG_INPUT
+    except OSError as error:  # no bug's: a path that may not be read, a disk that is full
+        where = f"{error.filename}: " if error.filename else ""
+        print(f"rtcd: {where}{error.strerror or error}", file=sys.stderr)
+        return WRONG_INPUT
+    except BrokenExecutor:
+        print("rtcd: a worker process was ended from outside, for want of memory perhaps: try fewer", file=sys.stderr)
+        return LOST_PROCESS
     except KeyboardInterrupt:
         print("stopped; run the same command to go on", file=sys.stderr)
         return INTERRUPTED

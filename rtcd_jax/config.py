@@ -481,9 +481,10 @@ def load(path: Path) -> Config:
 def read_yaml(path: Path) -> Any:
     """What a YAML file holds, as it stands there; `ConfigError` if there is no such file, or no YAML in it."""
     if not path.is_file():
-        there = sorted(str(other) for other in path.parent.glob("*.y*ml"))
-        advice = closest(path, there) if there else f"{path.parent} has no YAML file"
-        raise ConfigError([Problem((), f"no such file; {advice}")], str(path))
+        folder, what = (path, "is a folder") if path.is_dir() else (path.parent, "no such file")
+        there = sorted(str(other) for other in folder.glob("*.y*ml"))
+        advice = closest(path, there) if there else f"{folder} has no YAML file"
+        raise ConfigError([Problem((), f"{what}; {advice}")], str(path))
     return _plain_yaml(path.read_bytes(), str(path))
 
 

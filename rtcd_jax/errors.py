@@ -31,14 +31,16 @@ class UserError(ValueError):
 
 
 class ConfigError(UserError):
-    """Everything that is wrong with a configuration, at once."""
+    """Everything that is wrong with a configuration, at once: a line, or one each under a heading."""
 
     def __init__(self, problems: Iterable[Problem], source: str = "configuration"):
         self.problems = tuple(problems)
         self.source = source
-        count = len(self.problems)
-        head = f"{source}: {count} error{'s' if count > 1 else ''}"
-        super().__init__("\n".join([head, *(f"  {problem}" for problem in self.problems)]))
+        first, *others = self.problems
+        told = [f"{source}: {len(self.problems)} errors", *(f"  {problem}" for problem in self.problems)]
+        if not others:
+            told = [f"{source}: {first if first.path or first.value is not NO_VALUE else first.text}"]
+        super().__init__("\n".join(told))
 
 
 def closest(word: object, known: Sequence[str]) -> str:

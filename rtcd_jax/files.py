@@ -4,6 +4,7 @@ import contextlib
 import json
 import math
 import os
+import zipfile
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -54,6 +55,28 @@ def sync(path: Path) -> None:
             os.fsync(descriptor)
         finally:
             os.close(descriptor)
+
+
+def read_json(path: Path, advice: str) -> dict[str, Any]:
+    """The object in a JSON file. Raises `UserError` as `reading` does."""
+    with reading(path, advice):
+        found = json.loads(path.read_text(encoding="utf-8"))
+        if not isinstance(found, dict):
+            raise TypeError(f"must be a JSON object, is {found!r:.40}")
+        return found
+
+
+@contextlib.contextmanager
+def reading(path: Path, advice: str) -> Iterator[None]:
+    """Turns what a damaged file raises into one error that names it and ends with `advice`."""
+    try:
+        yield
+    except UserError:
+        raise
+    except (OSError, EOFError, KeyError, TypeError, ValueError, zipfile.BadZipFile) as error:
+        lacks = "it lacks " if isinstance(error, KeyError) else ""
+        told = getattr(error, "strerror", None) or lacks + " ".join(str(error).split()) or type(error).__name__
+        raise UserError(f"cannot read {path}: {told}; {advice}") from error
 
 
 @contextlib.contextmanager

@@ -20,7 +20,6 @@ import json
 import os
 import socket
 import time
-import zipfile
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self, TypeVar, final
@@ -30,7 +29,7 @@ import numpy as np
 from rtcd_jax import config as configuration
 from rtcd_jax.config import Config
 from rtcd_jax.errors import UserError
-from rtcd_jax.files import is_temporary, plain, replace, replace_json, sync, writing
+from rtcd_jax.files import is_temporary, plain, read_json, reading, replace, replace_json, sync, writing
 from rtcd_jax.provenance import provenance
 
 if TYPE_CHECKING:
@@ -40,6 +39,8 @@ FORMAT = "rtcd_jax run"
 VERSION = 1
 KEPT_STATES = 2
 _LOCK = ".lock"
+_RESTORE = "restore it, or make the run again"
+_FORGET = "restore it, or remove it: the run then goes on without its history"
 
 State = TypeVar("State")
 Arrays = Mapping[str, np.ndarray]
@@ -142,7 +143,7 @@ class RunFolder:
         For process 0.
         """
         file = self.path / "provenance.json"
-        told = json.loads(file.read_text(encoding="utf-8"))
+        told = read_json(file, _FORGET)
         told["starts"][-1]["seconds"] = round(time.monotonic() - self._begun, 1)
         replace_json(file, told)
 
@@ -200,19 +201,12 @@ def read_elite(folder: Path, name: str) -> tuple[dict[str, np.ndarray], dict[str
     if not all(path.is_file() for path in paths):
         there = ", ".join(sorted(path.stem for path in folder.glob("*.npz"))) or "nothing"
         raise UserError(f"{folder} has no {name}.npz with its {name}.json; there is {there}")
-    with _reading(paths[0]), paths[0].open("rb") as file, np.load(file, allow_pickle=False) as stored:
+    with reading(paths[0], _RESTORE), paths[0].open("rb") as file, np.load(file, allow_pickle=False) as stored:
         arrays = dict(stored)
-    with _reading(paths[1]):
-        return arrays, json.loads(paths[1].read_text(encoding="utf-8"))
-
-
-@contextlib.contextmanager
-def _reading(path: Path) -> Iterator[None]:
-    """Turns what a damaged file raises into one error that names it."""
-    try:
-        yield
-    except (OSError, EOFError, ValueError, zipfile.BadZipFile) as error:
-        raise UserError(f"cannot read {path}: {error}; restore it, or make the run again") from error
+    record = read_json(paths[1], _RESTORE)
+    if "status" not in record:
+        raise UserError(f"{paths[1]} lacks its status; {_RESTORE}")
+    return arrays, record
 
 
 def elite_names(path: Path) -> list[str]:
@@ -220,18 +214,40 @@ def elite_names(path: Path) -> list[str]:
     return sorted((file.stem for file in (path / "elites").glob("*.json") if file.stem.isdecimal()), key=int)
 
 
+def require_elites(path: Path) -> list[str]:
+    """`elite_names` of a run folder. Raises UserError if it is none, or its search is not finished."""
+    names = elite_names(path)
+    if not names:
+        _require_run(path)
+        raise UserError(f"{path} has no elites yet: finish the run first, by the command that began it")
+    return names
+
+
 def read_config(path: Path) -> Config:
     """The configuration of a run. Raises UserError if the folder is no run folder that this version reads."""
-    if not (path / "format.json").is_file():
-        raise UserError(f"{path} is no run folder: it has no format.json")
+    _require_run(path)
     _require_format(path)
     return _stored_config(path)
 
 
+def _require_run(path: Path) -> None:
+    if not (path / "format.json").is_file():
+        raise UserError(f"{path} is no run folder: it has no format.json")
+
+
 def read_generations(path: Path) -> list[dict[str, Any]]:
-    """The generations of a run, null for what was not finite; a torn last line is left out."""
-    with (path / "generations.jsonl").open("rb") as file:
-        return [json.loads(line) for line in file if line.endswith(b"\n")]
+    """The generations of a run, null for what was not finite; a torn last line is left out.
+
+    Raises UserError, with the line, if another one is damaged.
+    """
+    lines = path / "generations.jsonl"
+    found = []
+    with reading(lines, _RESTORE), lines.open("rb") as file:
+        for number, line in enumerate(file, 1):
+            if line.endswith(b"\n"):
+                with reading(Path(f"{lines}, line {number}"), _RESTORE):
+                    found.append(dict(json.loads(line)))
+    return found
 
 
 @contextlib.contextmanager
@@ -277,11 +293,8 @@ def _claim(path: Path, config: Config) -> None:
 
 def _require_format(path: Path) -> None:
     file = path / "format.json"
-    try:
-        mark = json.loads(file.read_text(encoding="utf-8"))
-        name, version = mark["format"], mark["version"]
-    except (ValueError, KeyError, TypeError) as error:
-        raise UserError(f"{file} is not readable: {error!r}; choose another folder") from error
+    mark = read_json(file, "choose another folder")
+    name, version = mark.get("format"), mark.get("version")
     if (name, version) != (FORMAT, VERSION):
         raise UserError(
             f"{file} says {name!r}, version {version!r}, but this rtcd_jax reads {FORMAT!r}, version {VERSION}: "
@@ -291,12 +304,14 @@ def _require_format(path: Path) -> None:
 
 def _stored_config(path: Path) -> Config:
     file = path / "config.yaml"
-    return configuration.parse_yaml(file.read_text(encoding="utf-8"), str(file))
+    with reading(file, _RESTORE):
+        return configuration.parse_yaml(file.read_bytes(), str(file))
 
 
 def _add_start(path: Path, config: Config) -> None:
     file = path / "provenance.json"
-    starts = json.loads(file.read_text(encoding="utf-8"))["starts"] if file.is_file() else []
+    with reading(file, _FORGET):
+        starts = list(read_json(file, _FORGET)["starts"]) if file.is_file() else []
     replace_json(file, {"config_hash": configuration.config_hash(config), "starts": [*starts, provenance()]})
 
 

@@ -15,7 +15,6 @@ import copy
 import csv
 import io
 import itertools
-import json
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -28,7 +27,7 @@ from rich.table import Table
 
 from rtcd_jax.config import Config, parse, read_yaml
 from rtcd_jax.errors import ConfigError, Problem, UserError, closest
-from rtcd_jax.files import replace, writing
+from rtcd_jax.files import read_json, reading, replace, writing
 
 TABLE = "table.csv"
 WAYS = ("product", "zip")
@@ -172,4 +171,6 @@ def _generations(folder: Path) -> int:
 
 def _volumes(folder: Path, name: str) -> dict[str, float]:
     record = folder / f"{name}.json"
-    return json.loads(record.read_text(encoding="utf-8"))["volumes"] if record.is_file() else {}
+    advice = "restore it, or make the run again"
+    with reading(record, advice):
+        return read_json(record, advice)["volumes"] if record.is_file() else {}

@@ -5,7 +5,7 @@
 
 Phi integrates the dynamics over one interval with the input held (paper, section II-B, whose DIRTRAN takes one explicit
 midpoint step instead). This verb plans for a whole population at once rather than for one candidate under vmap: the
-solver refills its lanes as candidates finish, so that slow ones do not hold up their neighbours.
+solver refills its lanes as candidates finish, so that slow ones do not hold up their neighbors.
 """
 
 from functools import partial

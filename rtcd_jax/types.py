@@ -28,7 +28,7 @@ class Status(enum.IntEnum):
 
 _MESSAGES = {
     Status.OK: "has a funnel",
-    Status.TRAJECTORY_NOT_SOLVED: "no start of the trajectory optimisation reached the tolerances on defects and boxes",
+    Status.TRAJECTORY_NOT_SOLVED: "no start of the trajectory optimization reached the tolerances on defects and boxes",
     Status.RICCATI_INDEFINITE: "the Riccati equation has no positive definite solution along the trajectory",
     Status.FUNNEL_EMPTY: "a knot's level fell below the smallest sampled level: some knot has no funnel",
     Status.NOT_FINITE: "a number of the candidate's evaluation is not finite",

@@ -1,6 +1,8 @@
 """Several processes on JAX's own runtime: one result, whoever is killed or asked to stop, and however it goes on."""
 
+import os
 import re
+import shutil
 import signal
 import socket
 import subprocess
@@ -62,6 +64,17 @@ def finished_by_one(path, devices):
 def test_two_processes_end_with_the_bytes_of_one(tmp_path, whole):
     outputs = [end(process) for process in start(tmp_path / "run")]
     assert all(output.endswith("done\n") for output in outputs), outputs
+    assert results(tmp_path / "run") == whole
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(shutil.which("mpirun") is None, reason="needs Open MPI's mpirun")
+def test_mpirun_tells_its_processes_by_itself(tmp_path, whole):
+    words = [sys.executable, "-m", "tests.killable", str(tmp_path / "run"), "joint", "0"]
+    root = {"OMPI_ALLOW_RUN_AS_ROOT": "1", "OMPI_ALLOW_RUN_AS_ROOT_CONFIRM": "1"}
+    command = ["mpirun", "--oversubscribe", "-n", "2", *words]
+    found = subprocess.run(command, cwd=ROOT, env={**os.environ, **root}, capture_output=True, text=True, timeout=300)
+    assert found.stdout.count("done\n") == 2, found.stdout + found.stderr
     assert results(tmp_path / "run") == whole
 
 

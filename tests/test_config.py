@@ -282,7 +282,7 @@ def test_no_mapping_at_all():
 def test_no_yaml(text, words):
     with pytest.raises(ConfigError) as caught:
         parse_yaml(text, "x.yaml")
-    assert str(caught.value).startswith(f"x.yaml: 1 error\n  the configuration: {words}")
+    assert str(caught.value).startswith(f"x.yaml: {words}")
 
 
 def test_exponent_without_a_dot_is_a_number():

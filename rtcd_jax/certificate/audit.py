@@ -17,6 +17,7 @@ from rich.table import Table
 from rtcd_jax.certificate.outside import Cost, Outside, elite_of
 from rtcd_jax.certificate.repair import defects, repaired
 from rtcd_jax.console import Console
+from rtcd_jax.errors import UserError
 from rtcd_jax.files import replace_json, writing
 from rtcd_jax.storage import write_elite
 from rtcd_jax.verify import CLOSED_FORMS, Elite
@@ -26,6 +27,7 @@ STEPS = 50
 """Runge-Kutta steps of an interval."""
 WORST = 8
 """Knots in the table."""
+RECORD = "audit.json"
 
 
 class Escapes(NamedTuple):
@@ -59,21 +61,31 @@ def audit(given: Outside, cost: Cost, states: int, seed: int, out: Path, console
     `out`/audit.json has the numbers, knot by knot. `rtcd certify out --elites 2` proves what can be proved of both.
 
     Raises:
-        UserError: no mended motion was found, or a folder that cannot be written.
+        UserError: no mended motion was found, or a folder that holds something else or cannot be written.
     """
+    _claim(out)
     arrays, record = elite_of(given, cost)
     seen = escapes(Elite.of(arrays, {**record, "epsilon": 0.0, "confidence": 1.0}), states, seed)
     off = np.max(np.abs(defects(given)), axis=0)
     mended = repaired(given, cost)
+    replace_json(out / RECORD, _record(given, mended, seen, off, states, seed))
     with writing(out):
-        (out / "elites").mkdir(parents=True, exist_ok=True)
+        (out / "elites").mkdir(exist_ok=True)
     for name, outside in (("000", mended), ("001", given)):
         write_elite(out / "elites", name, *elite_of(outside, cost))
-    replace_json(out / "audit.json", _record(given, mended, seen, off, states, seed))
     console.message(_table(given, seen))
     console.message(_summary(given, mended, seen, off, states))
     console.message(f"stored: {out}/elites/000 (mended), 001 (as given); prove them by `rtcd certify {out} --elites 2`")
     return not np.any(seen.share > 0)
+
+
+def _claim(out: Path) -> None:
+    """Makes the folder, unless it holds what is no audit's."""
+    foreign = sorted(item.name for item in out.iterdir()) if out.is_dir() and not (out / RECORD).is_file() else []
+    if foreign:
+        raise UserError(f"--out = {out}: must be a new or empty folder, or a former audit's: it has {foreign[0]}")
+    with writing(out):
+        out.mkdir(parents=True, exist_ok=True)
 
 
 def _record(given: Outside, mended: Outside, seen: Escapes, off: np.ndarray, states: int, seed: int) -> dict[str, Any]:

@@ -18,9 +18,8 @@ from scipy.stats import spearmanr
 
 from rtcd_jax.certificate.elite import Outcome, Step, certify_elite
 from rtcd_jax.console import Console
-from rtcd_jax.errors import UserError
 from rtcd_jax.files import replace_json, writing
-from rtcd_jax.storage import elite_names
+from rtcd_jax.storage import require_elites
 from rtcd_jax.workers import CONTEXT, processes
 
 POLL = 0.2
@@ -58,9 +57,7 @@ def certify_run(
     Raises:
         UserError: no run folder, a run without elites, or a folder that cannot be written.
     """
-    names = elite_names(folder)[:elites]
-    if not names:
-        raise UserError(f"{folder} has no elites yet: finish the run first, by the command that began it")
+    names = require_elites(folder)[:elites]
     target = folder / "certificates"
     with writing(target):
         target.mkdir(exist_ok=True)

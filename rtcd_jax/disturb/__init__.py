@@ -44,7 +44,7 @@ def disturb_run(folder: Path, states: int, seed: int, console: Console) -> None:
     pictures = draw_disturbance(folder)
     for line in _summary(contest, records):
         console.message(line)
-    console.message(f"{len(records)} records and {len(pictures)} figures in {place}; `rtcd report` shows them")
+    console.message(f"{len(records)} records and {len(pictures)} figures in {place}")
 
 
 def _all_motions(contest: Contest, states: int) -> int:

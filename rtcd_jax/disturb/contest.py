@@ -26,7 +26,7 @@ from rtcd_jax.errors import UserError
 from rtcd_jax.plants import plant_class
 from rtcd_jax.plants.base import Plant
 from rtcd_jax.plants.mjx import CpuDynamics, model_of
-from rtcd_jax.storage import elite_names, read_elite
+from rtcd_jax.storage import read_elite, require_elites
 from rtcd_jax.verify.elite import Elite
 from rtcd_jax.verify.simulate import ARRIVED, FORGOTTEN, settling_time
 
@@ -55,7 +55,7 @@ class Contest:
     design: Any
     loops: Loops
     horizon: float
-    config_hash: str
+    config_hash: str | None
 
     @property
     def indices(self) -> dict[str, int]:
@@ -103,21 +103,20 @@ def read_contest(folder: Path, console: Console) -> Contest:
     Raises:
         UserError: no elites, or a folder that cannot be read.
     """
-    if not elite_names(folder):
-        raise UserError(f"{folder} has no elites yet: finish the run first, by the command that began it")
+    require_elites(folder)
     read: dict[str, tuple[Elite, dict[str, Any]]] = {}
     for name, place, file in (("initial", folder, "initial"), ("best", folder / "elites", "000")):
         arrays, record = read_elite(place, file)
-        if record["status"] == "OK":
+        if record.get("status") == "OK":
             read[name] = Elite.of(arrays, record), record
         else:
-            console.message(f"{name}: left out, it has no funnel ({record['status']})")
+            console.message(f"{name}: left out, it has no funnel ({record.get('status')})")
     if "best" not in read:
         raise UserError(f"{folder} has no elite with a funnel to disturb")
-    return contest_of({name: elite for name, (elite, _) in read.items()}, read["best"][1]["config_hash"])
+    return contest_of({name: elite for name, (elite, _) in read.items()}, read["best"][1].get("config_hash"))
 
 
-def contest_of(elites: dict[str, Elite], config_hash: str) -> Contest:
+def contest_of(elites: dict[str, Elite], config_hash: str | None) -> Contest:
     """Elites of the same run, by name."""
     robots = [plant_class(elite.plant).from_parameters(elite.parameters) for elite in elites.values()]
     rates, ends = [], []

@@ -160,8 +160,8 @@ class Trouble(NamedTuple):
 def robustness(contest: Contest, seed: int, simulate: Simulate) -> dict[str, Any]:
     """Success by trouble and level, and the score: the mean over six criteria of the share of successes.
 
-    The criteria and their ranges follow the RealAIGym benchmark (Wiebe et al., "Open source dual-purpose acrobot and
-    pendubot platform", IEEE Robotics & Automation Magazine 2023), the robot and what counts as success are ours.
+    The criteria and their ranges follow the RealAIGym benchmark (Wiebe et al., "Open Source Dual-Purpose Acrobot and
+    Pendubot Platform", IEEE Robotics & Automation Magazine 31(2), 2024), the robot and what counts as success are ours.
     """
     random = np.random.default_rng(seed)
     found = troubles(contest)

@@ -19,7 +19,7 @@ from rtcd_jax.errors import UserError
 from rtcd_jax.export import robot, source, tables
 from rtcd_jax.export.bundle import Bundle, certificate_path, read_bundle
 from rtcd_jax.files import is_temporary, plain, replace, replace_json, writing
-from rtcd_jax.storage import elite_names
+from rtcd_jax.storage import require_elites
 
 FORMAT = "rtcd_jax export"
 VERSION = 1
@@ -38,9 +38,9 @@ def export_run(folder: Path, elite: int | str, target: Path, console: Console) -
         UserError: no run folder, no such elite, one without a funnel, or a target that holds something else.
     """
     name = elite if isinstance(elite, str) else f"{elite:03d}"
-    if name != "initial" and name not in elite_names(folder):
-        there = ", ".join(elite_names(folder)) or "none yet: finish the run first, by the command that began it"
-        raise UserError(f"{folder} has no elite {name}; there are {there}")
+    there = require_elites(folder)
+    if name != "initial" and name not in there:
+        raise UserError(f"{folder} has no elite {name}; there are {', '.join(there)}")
     former = _claim(target)
     bundle = read_bundle(folder, name)
     contents = _files(folder, bundle)

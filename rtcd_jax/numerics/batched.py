@@ -1,7 +1,7 @@
 """Linear algebra of many small matrices with the batch on the last axis.
 
-A batch of 2 x 2 systems is vectorised over the batch, not over the 2: with the batch last, every
-line below is one SIMD operation over all problems, and no problem's result depends on its neighbours.
+A batch of 2 x 2 systems is vectorized over the batch, not over the 2: with the batch last, every
+line below is one SIMD operation over all problems, and no problem's result depends on its neighbors.
 """
 
 import jax.numpy as jnp

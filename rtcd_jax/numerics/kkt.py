@@ -1,6 +1,6 @@
-"""The KKT system of a trajectory optimisation step, solved by one Riccati sweep.
+"""The KKT system of a trajectory optimization step, solved by one Riccati sweep.
 
-    minimise   sum_k  1/2 w_k' H_k w_k + g_k' w_k  +  1/2 curvature dh^2 + slope dh,     w_k = (dx_k, dh, du_k)
+    minimize   sum_k  1/2 w_k' H_k w_k + g_k' w_k  +  1/2 curvature dh^2 + slope dh,     w_k = (dx_k, dh, du_k)
     subject to dx_{k+1} = J_k w_k + c_k,   dx_0 = 0,   dx_N = 0
 
 The step length dh is one unknown shared by all intervals: it rides along as a constant state. The pinned

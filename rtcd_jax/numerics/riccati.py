@@ -6,7 +6,7 @@ The state x and the costate S x of the optimal feedback obey a linear system. Ov
 
     x(end) = A x(start) - G p(end),     p(start) = Q x(start) + A' p(end)
 
-with an `Interval` (A, G, Q); G and Q are positive semidefinite. Two neighbouring intervals compose to one, and the
+with an `Interval` (A, G, Q); G and Q are positive semidefinite. Two neighboring intervals compose to one, and the
 value at an interval's end maps to its start by S -> Q + A'S (I + G S)^-1 A. Nothing of this is stiff: gains of any
 size, for which an explicit integrator of the Riccati equation blows up, stay positive definite (Davison and Maki
 1973; the doubling of equal intervals is the structured doubling algorithm, Chu, Fan, Lin, Wang 2004).

@@ -22,5 +22,7 @@ def require_elite(elite: int | str) -> None:
 
 def require_run(folder: Path, usage: str) -> None:
     """Raises `UserError` if there is no such folder; `usage` is the command that makes one."""
+    if folder.is_file():
+        raise UserError(f"{folder} is a file: must be a run folder, as `{usage}` makes one")
     if not folder.is_dir():
         raise UserError(f"{folder}: no such run folder; `{usage}` makes one")

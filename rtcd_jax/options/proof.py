@@ -19,14 +19,14 @@ class CertifyOptions:
     Rungs: certified, by the solver's floating-point numbers; proved, by exact arithmetic for the true dynamics. The
     same command goes on after a kill. Exit code 1 if a funnel was not shown from t = 0 to the goal.
 
-    example: rtcd certify checkpoints/pendulum_rtcd --elites 8 --optimize_value
+    Example: rtcd certify checkpoints/pendulum_rtcd --elites 8 --optimize_value
     """
 
     run: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RUN", help="the run folder")]
     elites: Annotated[int, tyro.conf.arg(help="how many, the best first [-] (>= 1)")] = 1
     rung: Annotated[Literal["certified", "proved"], tyro.conf.arg(help="how much is to be shown")] = "proved"
     optimize_value: Annotated[bool, tyro.conf.arg(help="choose the ellipsoids' shapes too")] = False
-    workers: Annotated[int, tyro.conf.arg(help="processes, one elite each [-] (>= 1)")] = 2
+    workers: Annotated[int, tyro.conf.arg(help="processes, one elite each; 0 for one a core [-] (>= 0)")] = 0
 
 
 @dataclass(frozen=True)
@@ -36,7 +36,7 @@ class FalsifyOptions:
     Equations and integrator share nothing with the proof. Exit code 1 if a motion leaves the funnel, a limit or the
     goal region, beyond the integrator's own error, which is measured. The same command goes on after a kill.
 
-    example: rtcd falsify checkpoints/pendulum_rtcd/certificates/000.json --rollouts 100000
+    Example: rtcd falsify checkpoints/pendulum_rtcd/certificates/000.json --rollouts 100000
     """
 
     certificate: Annotated[
@@ -44,7 +44,7 @@ class FalsifyOptions:
     ]
     rollouts: Annotated[int, tyro.conf.arg(help="motions to simulate [-] (>= 1)")] = 1_000_000
     seed: Annotated[int, tyro.conf.arg(help="of their starts [-] (>= 0)")] = 0
-    workers: Annotated[int, tyro.conf.arg(help="processes [-] (>= 1)")] = 2
+    workers: Annotated[int, tyro.conf.arg(help="processes, 0 for one a core [-] (>= 0)")] = 0
 
 
 @dataclass(frozen=True)
@@ -54,7 +54,7 @@ class AuditOptions:
     FILE is a table: after a row of headings one row a knot, with the time, the states, the input held until the next
     knot, rho, and the upper triangle of S. The gains are R^-1 B'S. Exit code 1 if a state left the funnel.
 
-    example: rtcd audit funnel.csv --plant pendulum --parameters m=0.7 l=0.4 b=0.1 g=9.81 torque_limit=2.5
+    Example: rtcd audit funnel.csv --plant pendulum --parameters m=0.7 l=0.4 b=0.1 g=9.81 torque_limit=2.5
     --q 10 1 --r 0.1 --out checkpoints/audit
     """
 
@@ -84,7 +84,7 @@ class AuditOptions:
 def read_certify(arguments: Sequence[str]) -> CertifyOptions:
     """The checked options of `rtcd certify`; `UserError` if one is out of range."""
     options = tyro.cli(CertifyOptions, args=arguments, prog="rtcd certify", use_underscores=True)
-    require_at_least(options, elites=1, workers=1)
+    require_at_least(options, elites=1, workers=0)
     require_run(options.run, OPTIMIZE_USAGE)
     return options
 
@@ -92,7 +92,7 @@ def read_certify(arguments: Sequence[str]) -> CertifyOptions:
 def read_falsify(arguments: Sequence[str]) -> FalsifyOptions:
     """The checked options of `rtcd falsify`; `UserError` if one is out of range."""
     options = tyro.cli(FalsifyOptions, args=arguments, prog="rtcd falsify", use_underscores=True)
-    require_at_least(options, rollouts=1, seed=0, workers=1)
+    require_at_least(options, rollouts=1, seed=0, workers=0)
     if options.certificate.is_dir():
         return replace(options, certificate=options.certificate / "certificates" / "000.json")
     return options

@@ -23,6 +23,8 @@ class OptimizeOptions:
     """Search for the design and the weights with the largest funnel; the same command resumes a stopped run.
 
     CONFIG comes first. Every key of the YAML is an option; without one, the defaults are those of the paper's pendulum.
+
+    Example: rtcd optimize configs/pendulum_rtcd.yaml --run checkpoints/mine --search.population 512
     """
 
     config: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="CONFIG", help="the experiment, a YAML file")]

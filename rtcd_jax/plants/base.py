@@ -1,4 +1,4 @@
-"""What a robot must say. All else (linearisation, rollouts, volumes) is derived from this."""
+"""What a robot must say. All else (linearization, rollouts, volumes) is derived from this."""
 
 import abc
 from collections.abc import Mapping
@@ -15,7 +15,7 @@ class Plant(eqx.Module):
     """A robot: its physical constants are the fields, its design is a pytree of its own named fields.
 
     Subclasses are final. `dynamics` is closed-form and smooth in all arguments: it is differentiated
-    twice by the trajectory optimiser and evaluated millions of times by the funnel.
+    twice by the trajectory optimizer and evaluated millions of times by the funnel.
     """
 
     state_names: ClassVar[tuple[str, ...]]

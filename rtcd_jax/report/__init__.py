@@ -8,6 +8,6 @@ tube.py, replay.py         was a measured motion inside the funnel?
 render.py, animate.py      the swing-up before MuJoCo's camera
 """
 
-from rtcd_jax.report.page import report
+from rtcd_jax.report.page import refresh, report
 
-__all__ = ["report"]
+__all__ = ["refresh", "report"]

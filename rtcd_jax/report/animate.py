@@ -21,7 +21,7 @@ from rtcd_jax.files import writing
 from rtcd_jax.report.motion import Motions, dynamics_before_mujoco, frame_times, motions
 from rtcd_jax.report.render import Camera, choose_backend
 from rtcd_jax.report.tube import Tube
-from rtcd_jax.storage import elite_names, read_config, read_elite
+from rtcd_jax.storage import read_config, read_elite, require_elites
 
 if TYPE_CHECKING:
     from PIL.Image import Image
@@ -81,8 +81,7 @@ def animate_run(folder: Path, to: Path | None, seed: int, console: Console) -> l
             be written.
     """
     config = read_config(folder)
-    if not elite_names(folder):
-        raise UserError(f"{folder} has no elites yet: finish the run first, by the command that began it")
+    require_elites(folder)
     target = to or folder / "animation"
     with writing(target):
         target.mkdir(parents=True, exist_ok=True)
@@ -125,10 +124,10 @@ def _columns(folder: Path, config: Config, seed: int, console: Console) -> list[
         if label == "initial" and not (place / "initial.json").is_file():
             continue
         arrays, record = read_elite(place, name)
-        if record["status"] == "OK":
+        if record.get("status") == "OK":
             tubes[label] = Tube.of(arrays, record)
         else:
-            console.message(f"{label}: nothing to show, it has no funnel ({record['status']})")
+            console.message(f"{label}: nothing to show, it has no funnel ({record.get('status')})")
     if "best" not in tubes:
         raise UserError(f"{folder / 'elites'}: 000 has no funnel")
     disturbed = _disturbed(tubes["best"], seed)

@@ -1,13 +1,12 @@
 """`disturbance/NAME.png` and `.pdf`: what `rtcd disturb` saw, the initial candidate beside the best one."""
 
-import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from rtcd_jax.errors import UserError
+from rtcd_jax.files import read_json
 from rtcd_jax.report.canvas import GRAY, LIGHT, SMALL, WIDTH, blank, written
 from rtcd_jax.report.words import words
 
@@ -37,18 +36,11 @@ def draw_disturbance(folder: Path) -> list[Path]:
         ("impulse", _impulse, (WIDTH, 3.2)),
         ("robustness", _robustness, None),
     ):
-        record = _read(place / f"{name}.json")
+        record = read_json(place / f"{name}.json", "make it by `rtcd disturb`")
         with blank(size or (WIDTH, 0.9 + _STRIP * 1.75 * len(record["troubles"]))) as figure:
             draw(figure, record)
             drawn += written(figure, place, name)
     return drawn
-
-
-def _read(path: Path) -> dict[str, Any]:
-    try:
-        return json.loads(path.read_bytes())
-    except (OSError, ValueError) as error:
-        raise UserError(f"cannot read {path}: {error}; make it by `rtcd disturb`") from error
 
 
 def _off_nominal(figure: "Figure", record: Mapping[str, Any]) -> None:

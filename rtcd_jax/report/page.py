@@ -55,6 +55,18 @@ def report(folders: Sequence[Path], to: Path | None = None) -> list[Path]:
     return [page, *drawn]
 
 
+def refresh(folder: Path) -> Path | None:
+    """The run's page written anew, with what was proved, verified and tried since; None where there is no page.
+
+    The figures beside it show none of that, and stay. Raises UserError as `report`.
+    """
+    page = folder / "report.html"
+    if not page.is_file():
+        return None
+    replace(page, render([read_run(folder)]).encode())
+    return page
+
+
 def draw_figures(run: Run) -> list[Path]:
     """The figures of one run, NAME.png and .pdf in `run.figures`. Raises UserError if they cannot be written."""
     over = draw_over([run], run.figures, "overlay")
@@ -143,7 +155,8 @@ def _sections(runs: Sequence[Run], figures: Mapping[str, Any]) -> Iterator[str]:
         yield _section("Design and weights", f'<div class="grid">{boxes}</div>')
         yield _section("Elites", _table(tables.elites(alone)), _note("Click a heading to sort."))
     else:
-        yield _section("Search", _plot("convergence"))
+        told = "Sampled volumes, each search's own objective: solid the best so far, dotted each generation's median."
+        yield _section("Search", _plot("convergence"), _note(told))
     yield _section("Certificates", *_certified(runs))
     seen = tables.verification(runs)
     yield _section("Verification", _table(seen) if seen else _note("Nothing yet: rtcd verify RUN."))

@@ -15,6 +15,8 @@ from rtcd_jax.report.shapes import planes
 from rtcd_jax.report.words import letter, volume_unit, words
 
 Plot = dict[str, Any]
+SEARCHES = {"best_so_far": ("y", "solid", 2.2), "median": ("y", "dot", 1.2), "feasible": ("y2", "solid", 1.2)}
+"""What is compared of searches: on which axis, and how its lines look."""
 POINTS = 49
 """Of an ellipse's outline: a page of 200 knots stays below two megabytes."""
 
@@ -106,18 +108,24 @@ def convergence_plot(run: Run) -> Plot:
 
 
 def progress_plot(runs: Sequence[Run]) -> Plot:
-    """The best so far of several searches over their candidates, each by its own objective."""
-    data, units = [], {volume_unit(run.config, run.config.search.objective) for run in runs}
+    """Several searches over their candidates, each by its own objective: volumes above, feasible shares below."""
+    data, volumes, units = [], [], {volume_unit(run.config, run.config.search.objective) for run in runs}
     for run in runs:
-        objective = run.config.search.objective
         evaluated = _numbers(column(run.generations, "evaluations"))
-        name = f"{run.name} ({words(objective)})"
-        data.append(_line(evaluated, column(run.generations, "best_so_far"), name, run.best.color))
+        legend = f"{run.name} ({words(run.config.search.objective)})"
+        for name, (axis, dash, width) in SEARCHES.items():
+            first, values = name == "best_so_far", column(run.generations, name)
+            told = legend if first else f"{run.name}, {words(name)}"
+            group = {"legendgroup": run.name, "showlegend": first, "yaxis": axis}
+            data.append(_line(evaluated, values, told, run.best.color, dash, width) | group)
+            volumes += [values] * (axis == "y")
+    scale = _scale(np.concatenate(volumes))
     return {
         "data": data,
         "layout": {
-            "xaxis": {"title": {"text": "candidates"}},
-            "yaxis": {"title": {"text": f"best so far [{', '.join(sorted(units))}]"}},
+            "xaxis": {"title": {"text": "candidates"}, "anchor": "y2"},
+            "yaxis": {"title": {"text": f"volume [{', '.join(sorted(units))}]"}, "domain": [0.32, 1], **scale},
+            "yaxis2": {"title": {"text": "with a funnel"}, "domain": [0, 0.24], "range": [0, 1.03]},
         },
     }
 

@@ -1,7 +1,6 @@
 """A finished run as reports show it: everything that its folder holds, checked once and given names."""
 
 import itertools
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -12,8 +11,9 @@ from jaxtyping import Float
 
 from rtcd_jax.config import Config
 from rtcd_jax.errors import UserError
+from rtcd_jax.files import read_json
 from rtcd_jax.report.words import VOLUMES
-from rtcd_jax.storage import elite_names, read_config, read_elite, read_generations
+from rtcd_jax.storage import elite_names, read_config, read_elite, read_generations, require_elites
 
 # Okabe and Ito's colors: told apart by all kinds of color vision.
 BLUE, VERMILION = "#0072B2", "#D55E00"
@@ -21,6 +21,12 @@ COLORS = (VERMILION, "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
 """Of compared runs, in turn."""
 INITIALS = (BLUE, "#5F6B7A", "#8C6D31", "#7A5195")
 """Of their initial candidates, where they differ."""
+
+
+_OF_A_GENERATION = (
+    "index", "evaluations", "objective", "best", "median", "best_so_far", "feasible", "counts", "sigma", "restarts",
+    "genomes", "volumes",
+)  # fmt: skip
 
 
 @final
@@ -118,20 +124,19 @@ def read_run(path: Path) -> Run:
         absence=absence,
         generations=read_search(path),
         elites={name: read_elite(folder, name)[1] for name in elite_names(path)},
-        certificates=_json(path / "certificates" / "summary.json") or {},
-        verification={file.stem: _json(file) or {} for file in sorted((path / "verification").glob("*.json"))},
+        certificates=_json(path / "certificates" / "summary.json"),
+        verification={file.stem: _json(file) for file in sorted((path / "verification").glob("*.json"))},
         experiments=tuple(_experiments(path / "disturbance")),
-        provenance=_json(path / "provenance.json") or {},
+        provenance=_json(path / "provenance.json"),
     )
 
 
 def read_best(path: Path) -> Shown:
     """The best elite. Raises UserError if there is none, or it has no funnel."""
-    if not elite_names(path):
-        raise UserError(f"{path} has no elites yet: finish the run first, by the command that began it")
+    require_elites(path)
     arrays, record = read_elite(path / "elites", "000")
-    if record["status"] != "OK":
-        raise UserError(f"{path / 'elites'}: 000 has no funnel ({record['status']})")
+    if record.get("status") != "OK":
+        raise UserError(f"{path / 'elites'}: 000 has no funnel ({record.get('status')})")
     return Shown.of("best", VERMILION, arrays, record)
 
 
@@ -140,8 +145,8 @@ def read_initial(path: Path) -> tuple[Shown | None, str]:
     if not (path / "initial.json").is_file():
         return None, "no initial candidate was stored"
     arrays, record = read_elite(path, "initial")
-    if record["status"] != "OK":
-        return None, f"the initial candidate has no funnel ({record['status']})"
+    if record.get("status") != "OK":
+        return None, f"the initial candidate has no funnel ({record.get('status')})"
     return Shown.of("initial", BLUE, arrays, record), ""
 
 
@@ -150,6 +155,10 @@ def read_search(path: Path) -> list[dict[str, Any]]:
     generations = read_generations(path) if (path / "generations.jsonl").is_file() else []
     if not generations:
         raise UserError(f"{path} has no generations yet: begin the run first")
+    for number, record in enumerate(generations, 1):
+        missing = [name for name in _OF_A_GENERATION if name not in record]
+        if missing:
+            raise UserError(f"{path / 'generations.jsonl'}, line {number} lacks {', '.join(missing)}")
     return generations
 
 
@@ -193,15 +202,10 @@ def _experiments(folder: Path) -> list[Experiment]:
     found = []
     for file in sorted(folder.glob("*.json")):
         pictures = sorted(folder.glob(f"{file.stem}*.png"))
-        found.append(Experiment(file.stem, (_json(file) or {}).get("summary", {}), tuple(pictures)))
+        found.append(Experiment(file.stem, _json(file).get("summary", {}), tuple(pictures)))
     return found
 
 
-def _json(path: Path) -> Any:
-    """The file's content, None where there is no file. Raises UserError if it is damaged."""
-    if not path.is_file():
-        return None
-    try:
-        return json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise UserError(f"cannot read {path}: {error}; remove it, or make it again") from error
+def _json(path: Path) -> dict[str, Any]:
+    """The file's content, nothing where there is no file. Raises UserError if it is damaged."""
+    return read_json(path, "remove it, or make it again") if path.is_file() else {}

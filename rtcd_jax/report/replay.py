@@ -19,7 +19,7 @@ from rtcd_jax.report.measured import Measured, jumps, read_measured
 from rtcd_jax.report.reading import BLUE, VERMILION, Shown
 from rtcd_jax.report.shapes import planes
 from rtcd_jax.report.tube import Tube
-from rtcd_jax.storage import elite_names, read_config, read_elite
+from rtcd_jax.storage import read_config, read_elite, require_elites
 
 LEAST = 1e-4
 """V/rho that the figure still tells from zero."""
@@ -78,8 +78,7 @@ def replay_run(folder: Path, file: Path, elite: int | str, console: Console) -> 
     """
     config = read_config(folder)
     name, place = (f"{elite:03d}", folder / "elites") if isinstance(elite, int) else (elite, folder)
-    if not elite_names(folder):
-        raise UserError(f"{folder} has no elites yet: finish the run first, by the command that began it")
+    require_elites(folder)
     arrays, record = read_elite(place, name)
     tube = Tube.of(arrays, record)
     measured = read_measured(file, arrays["x"].shape[1])

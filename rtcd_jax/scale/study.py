@@ -77,8 +77,11 @@ def study(
 
 def _kept(path: Path, mark: Point) -> Iterator[Point]:
     if path.is_file():
-        for line in path.read_text(encoding="utf-8").splitlines():
-            point = json.loads(line)
+        for line in path.read_text(encoding="utf-8", errors="replace").splitlines():
+            try:
+                point = dict(json.loads(line))
+            except (TypeError, ValueError):  # torn by a kill: that point is measured again
+                continue
             if {key: point.get(key) for key in mark} == mark and "failed" not in point:
                 yield point
 

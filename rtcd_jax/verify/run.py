@@ -1,5 +1,6 @@
 """`rtcd verify`: all chunks of a run's trials on all cores; what is done is kept, so that a stopped one goes on."""
 
+import contextlib
 import functools
 import hashlib
 import io
@@ -17,8 +18,8 @@ from rich.table import Table
 
 from rtcd_jax.console import Console
 from rtcd_jax.errors import UserError
-from rtcd_jax.files import replace, replace_json, writing
-from rtcd_jax.storage import elite_names, read_elite
+from rtcd_jax.files import reading, replace, replace_json, writing
+from rtcd_jax.storage import read_elite, require_elites
 from rtcd_jax.verify.elite import Elite
 from rtcd_jax.verify.simulate import Outcome
 from rtcd_jax.verify.verification import Trial, Verification
@@ -69,16 +70,13 @@ def verify_run(folder: Path, states: int, seed: int, workers: int, console: Cons
     Raises:
         UserError: no run folder, a run without elites, or a folder that cannot be read or written.
     """
-    if not folder.is_dir():
-        raise UserError(f"{folder} is no run folder: it does not exist")
-    if not elite_names(folder):
-        raise UserError(f"{folder} has no elites yet: finish the run first, by the command that began it")
+    require_elites(folder)
     parts = folder / "verification" / ".parts"
     with writing(parts):
         parts.mkdir(parents=True, exist_ok=True)
     trials = {}
     for funnel in PLACES:
-        status = _read(folder, funnel)[1]["status"]
+        status = _read(folder, funnel)[1].get("status")
         if status == "OK":
             trials[funnel] = _trial(folder, funnel, states, seed)
         else:
@@ -157,10 +155,10 @@ def _keep(part: Path, outcome: Outcome) -> None:
 
 
 def _kept(part: Path) -> Outcome | None:
-    if not part.is_file():
-        return None
-    with np.load(part, allow_pickle=False) as stored:
+    """None for what is not there, or is damaged: it is made again."""
+    with contextlib.suppress(UserError), reading(part, "make it again"), np.load(part, allow_pickle=False) as stored:
         return Outcome(**stored)
+    return None
 
 
 def _table(verifications: Mapping[str, Verification]) -> str:

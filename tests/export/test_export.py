@@ -162,7 +162,7 @@ def test_a_folder_of_something_else_is_left_alone(run, tmp_path):
 def test_an_elite_that_is_not_there_is_answered_with_those_that_are(run, tmp_path):
     with pytest.raises(UserError, match=r"has no elite 007; there are 000$"):
         export_run(run, 7, tmp_path / "lab", Silent())
-    with pytest.raises(UserError, match=r"has no elite 000; there are none yet: finish the run first"):
+    with pytest.raises(UserError, match=r"no run folder: it has no format"):
         export_run(tmp_path, 0, tmp_path / "lab", Silent())
     assert not (tmp_path / "lab").exists()
 

@@ -14,18 +14,21 @@ usage: rtcd check FILE
 Check a certificate, certificates/NNN.json of a run folder, by exact arithmetic, without any solver. Exit code 0 only
 if all of it holds; 1 if it is refused, with the place and the reason; 2 if there is nothing to read.
 
-example: rtcd check checkpoints/pendulum_rtcd/certificates/000.json"""
+Example: rtcd check checkpoints/pendulum_rtcd/certificates/000.json"""
 
 
 def main(arguments: Sequence[str]) -> int:
     """0 and what is proved; 1 and why nothing is; 2 where there is nothing to read."""
-    if len(arguments) != 1 or arguments[0] in ("-h", "--help"):
+    if arguments[:1] in (["-h"], ["--help"]):
         print(USAGE)
-        return 0 if arguments[:1] in (["-h"], ["--help"]) else 2
+        return 0
+    if len(arguments) != 1:
+        print(f"{len(arguments)} files: must be one, as in `rtcd check RUN/certificates/000.json`", file=sys.stderr)
+        return 2
     try:
         report = check_file(Path(arguments[0]), _counted)
     except OSError as error:
-        print(f"{arguments[0]}: {error.strerror}", file=sys.stderr)
+        print(f"{arguments[0]}: {error.strerror}; a certificate is RUN/certificates/NNN.json", file=sys.stderr)
         return 2
     except Refused as refused:
         print(f"REFUSED {arguments[0]}\n{refused}", file=sys.stderr)

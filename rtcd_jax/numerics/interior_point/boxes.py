@@ -1,0 +1,55 @@
+"""Bounded variables: their slacks and duals, and reductions over everything but the batch, which is last."""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+
+class Boxed(NamedTuple):
+    """One value for each bounded variable: interior states with a finite limit, inputs, the step."""
+
+    xs: Float[Array, "N-1 b P"]
+    us: Float[Array, "N m P"]
+    h: Float[Array, "1 P"]
+
+
+def total(a):
+    return jnp.sum(a, tuple(range(a.ndim - 1)))
+
+
+def largest(a):
+    return jnp.max(jnp.abs(a), tuple(range(a.ndim - 1)), initial=0.0)
+
+
+def least(a):
+    return jnp.min(a, tuple(range(a.ndim - 1)), initial=jnp.inf)
+
+
+def sum_over(boxed):
+    return sum(total(leaf) for leaf in boxed)
+
+
+def log_sum(slacks: Boxed):
+    return sum(total(jnp.log(slack[0] * slack[1])) for slack in slacks)
+
+
+def complementarity(duals: Boxed, slacks: Boxed, barrier):
+    errors = [largest(dual * slack - barrier) for dual, slack in zip(duals, slacks, strict=True)]
+    return jnp.maximum(jnp.maximum(errors[0], errors[1]), errors[2])
+
+
+def push_inside(value, low, high, share=1e-2):
+    """Section 3.6: strictly inside the box, by a share of the bound's size or of the box."""
+    below = jnp.minimum(share * jnp.maximum(1.0, jnp.abs(low)), share * (high - low))
+    above = jnp.minimum(share * jnp.maximum(1.0, jnp.abs(high)), share * (high - low))
+    return jnp.clip(value, low + below, high - above)
+
+
+def boundary_step(values: Boxed, steps: Boxed, fraction):
+    """Largest step <= 1 that keeps values + step above (1 - fraction) values: (15)."""
+    room = [
+        least(jnp.where(d < 0, -fraction * v / jnp.where(d < 0, d, -1.0), jnp.inf))
+        for v, d in zip(values, steps, strict=True)
+    ]
+    return jnp.minimum(1.0, jnp.minimum(jnp.minimum(room[0], room[1]), room[2]))
