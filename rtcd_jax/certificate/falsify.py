@@ -101,9 +101,8 @@ def falsify_file(path: Path, rollouts: int, seed: int, workers: int, console: Co
     """
     motions = Motions.of(path)
     digest = hashlib.sha256(path.read_bytes()).hexdigest()
-    journal = Journal(
-        path.with_name(f".{path.stem}.falsify.jsonl"), {"certificate": digest, "rollouts": rollouts, "seed": seed}
-    )
+    head = {"certificate": digest, "rollouts": rollouts, "seed": seed, "chunk": CHUNK}
+    journal = Journal(path.with_name(f".{path.stem}.falsify.jsonl"), head)
     steps = enough_steps(motions, seed)
     began, kept = time.monotonic(), len(journal.lines)
     parts = [Part(**line) for line in journal.lines]

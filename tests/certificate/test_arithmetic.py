@@ -164,20 +164,24 @@ def test_positive_definite_matrices():
 
 
 def test_positive_polynomials():
-    one = [Q(1), Q(0), Q(-1)]
-    assert check.is_positive([*one[:2], Q(-99, 100)], Q(-1), Q(1))
-    assert not check.is_positive(one, Q(-1), Q(1))
-    assert check.is_positive([Q(101, 10000), Q(-2, 10), Q(1)], Q(-1), Q(1))  # (s - 1/10)^2 + 1/10000
-    assert not check.is_positive([Q(99, 10000), Q(-2, 10), Q(1)], Q(-1), Q(1))
+    def shown(*coefficients):
+        return check.is_positive(SPACE.compose(coefficients, SPACE.s), Q(-1), Q(1))
+
+    assert shown(Q(1), Q(0), Q(-99, 100))
+    assert not shown(Q(1), Q(0), Q(-1))
+    assert shown(Q(101, 10000), Q(-2, 10), Q(1))  # (s - 1/10)^2 + 1/10000
+    assert not shown(Q(99, 10000), Q(-2, 10), Q(1))
+    assert shown(Q(1))
+    assert not shown(Q(0))
 
 
 def test_cofactors():
     random = np.random.default_rng(2)
     for n in (2, 4):
         a = random.normal(size=(n, n))
-        adjugate, determinant = check.cofactors([[[Q(*c.as_integer_ratio())] for c in row] for row in a])
-        assert float(determinant[0]) == pytest.approx(np.linalg.det(a))
-        numbers = np.array([[float(c[0]) for c in row] for row in adjugate])
+        adjugate, determinant = check.cofactors([[Q(*c.as_integer_ratio()) for c in row] for row in a])
+        assert float(determinant) == pytest.approx(np.linalg.det(a))
+        numbers = np.array([[float(c) for c in row] for row in adjugate])
         np.testing.assert_allclose(numbers, np.linalg.inv(a) * np.linalg.det(a), atol=1e-12)
 
 

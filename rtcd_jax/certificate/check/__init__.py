@@ -6,9 +6,9 @@ believe this folder alone. To be read in this order:
 
     exact     rational numbers and their rounding
     taylor    polynomials in time and space, sine and cosine, with bounds of what they leave out
+    matrix    products and determinants
     claim     the robots' equations, and the closed loop that a certificate is about
     squares   positive on the sphere: sums of squares, by Bernstein polynomials in the time
-    scalar    polynomials in the time alone
     funnel    what has to be shown on one interval of the funnel
     goal      what has to be shown at the goal
     file      the file's words into numbers
@@ -50,7 +50,7 @@ from rtcd_jax.certificate.check.exact import PI, PI_ERROR, Q, Refused, alternati
 from rtcd_jax.certificate.check.file import Node, parse, read_claim, read_stretch, seal
 from rtcd_jax.certificate.check.funnel import Motion, Stretch, funnel_obligations, insist_bounds, motion
 from rtcd_jax.certificate.check.goal import Shell, goal_field, goal_obligations
-from rtcd_jax.certificate.check.scalar import cofactors
+from rtcd_jax.certificate.check.matrix import cofactors
 from rtcd_jax.certificate.check.squares import (
     Obligation,
     Witness,
@@ -63,55 +63,3 @@ from rtcd_jax.certificate.check.squares import (
 )
 from rtcd_jax.certificate.check.taylor import Space, Taylor, economize, peak, polynomial, sine_and_cosine, terms_of
 from rtcd_jax.certificate.check.verdict import FORMAT, VERSION, Report, check, check_file, sentence, volumes_of
-
-__all__ = [
-    "FORMAT",
-    "PI",
-    "PI_ERROR",
-    "PLANTS",
-    "VERSION",
-    "Claim",
-    "Motion",
-    "Node",
-    "Obligation",
-    "Plant",
-    "Q",
-    "Refused",
-    "Report",
-    "Shell",
-    "Space",
-    "Stretch",
-    "Taylor",
-    "Witness",
-    "alternating",
-    "bernstein",
-    "check",
-    "check_file",
-    "cofactors",
-    "economize",
-    "funnel_obligations",
-    "goal_field",
-    "goal_obligations",
-    "insist",
-    "insist_bounds",
-    "is_positive",
-    "is_positive_definite",
-    "main",
-    "margin",
-    "monomials",
-    "motion",
-    "near",
-    "parse",
-    "peak",
-    "polynomial",
-    "read_claim",
-    "read_stretch",
-    "reduced",
-    "root_up",
-    "seal",
-    "sentence",
-    "sine_and_cosine",
-    "terms_of",
-    "up",
-    "volumes_of",
-]

@@ -4,19 +4,9 @@ from typing import Any, NamedTuple
 
 from rtcd_jax.certificate.check.claim import Claim
 from rtcd_jax.certificate.check.exact import Q, alternating, insist, near
-from rtcd_jax.certificate.check.scalar import (
-    cofactors,
-    derivative,
-    norm_squared,
-    plus,
-    product_entry,
-    substitute,
-    times,
-)
+from rtcd_jax.certificate.check.matrix import cofactors, dot
 from rtcd_jax.certificate.check.squares import Obligation, Witness, is_positive
-from rtcd_jax.certificate.check.taylor import Space, Taylor, sine_and_cosine, size
-
-SINGULAR = "the mass matrix' determinant is not shown to be positive"
+from rtcd_jax.certificate.check.taylor import Space, Taylor, derivative, sine_and_cosine, size
 
 
 class Motion(NamedTuple):
@@ -46,60 +36,83 @@ class Stretch(NamedTuple):
 
 def motion(claim: Claim, piece: Stretch) -> Motion:
     """The closed loop's and the funnel's data on one interval."""
-    k, dt = piece.knot, claim.dt
-    share = [(piece.start + piece.end) / 2, (piece.end - piece.start) / 2]  # of the knots' interval, at s
-    speed = 1 / (dt * share[1])  # ds/dt
+    k, dt, n, space = piece.knot, claim.dt, claim.n, Space(claim.n, *piece.orders)
+    half = (piece.end - piece.start) / 2
+    share = space.s * half + space.poly((piece.start + piece.end) / 2)  # of the knots' interval, at s
+    speed = 1 / (dt * half)  # ds/dt
     state = []
     for a, va, b, vb in zip(claim.x[k], claim.rates[k][0], claim.x[k + 1], claim.rates[k][1], strict=True):
         hermite = [a, dt * va, 3 * (b - a) - dt * (2 * va + vb), 2 * (a - b) + dt * (va + vb)]
-        state.append(substitute(hermite, share))
-    gain = [substitute([a, b - a], share) for a, b in zip(claim.K[k], claim.K[k + 1], strict=True)]
+        state.append(space.compose(hermite, share))
+    gain = [space.compose([a, b - a], share) for a, b in zip(claim.K[k], claim.K[k + 1], strict=True)]
     axes = []
     for first, last, bend0, bend1 in zip(piece.first, piece.last, *piece.bend, strict=True):
         row = []
         for a, b, c, d in zip(first, last, bend0, bend1, strict=True):
-            row.append([(a + b) / 2 + c, (b - a) / 2 + d, -c, -d])
+            row.append(space.compose([(a + b) / 2 + c, (b - a) / 2 + d, -c, -d], space.s))
         axes.append(row)
-    rate = [[c * speed for c in derivative(a)] for a in state]
-    axes_rate = [[[c * speed for c in derivative(a)] for a in row] for row in axes]
+    rate = [derivative(n, a) * speed for a in state]
+    axes_rate = [[derivative(n, a) * speed for a in row] for row in axes]
     return Motion(state, rate, gain, claim.u[k], axes, axes_rate, 2 / speed)
 
 
 def funnel_obligations(claim: Claim, piece: Stretch, place: str) -> dict[str, Obligation]:
     """By case of the saturation: "free", "high" (u = F), "low" (u = -F); those that cannot occur are left out."""
-    data, space, every = motion(claim, piece), Space(claim.n, *piece.orders), range(claim.n)
+    data, space = motion(claim, piece), Space(claim.n, *piece.orders)
     adjugate, determinant = cofactors(data.axes)
     insist(is_positive(determinant, Q(-1), Q(1)), place, "an ellipsoid is degenerate: det L must be > 0")
-    y = [space.y(i) for i in every]
-    error = [space.sum(space.poly(data.axes[i][j]) * y[j] for j in every) for i in every]
-    drag = [space.sum(space.poly(data.axes_rate[i][j]) * y[j] for j in every) for i in every]
-    x = [Taylor(space, space.poly(data.state[i]) + error[i]).tidy() for i in every]
-    angle = x[claim.plant.angle]
-    center, _ = near(angle.constant, 20)
+    y = [space.y(i) for i in range(claim.n)]
+    error = [dot(row, y) for row in data.axes]
+    x = [Taylor(space, center + e).tidy() for center, e in zip(data.state, error, strict=True)]
+    center, _ = near(x[claim.plant.angle].constant, 20)
     insist(abs(center) <= 64, place, "the nominal angle is beyond 64 rad")
     values = alternating(center, 1), alternating(center, 0)
-    sine, cosine = sine_and_cosine(angle, center, (values[0][0], values[1][0], values[0][1]), place)
-    d, a, b = claim.plant.field(claim.parameters, x, sine, cosine)
-    d0 = d.constant
-    insist(2 * d0 - size(d.p) - d.r - d.d > 0, place, SINGULAR)
-    wide = space._replace(y_order=space.y_order + 1)
-    scale, _ = near(2 / (d0 * determinant[0]), 30)
-    push = [Taylor(wide, space.sum(space.poly(adjugate[i][j]) * y[i] for i in every)) * scale for j in every]
-    free, forced = wide.enclose(0), wide.enclose(0)
-    for j in every:
-        fall = a[j] - d * Taylor(space, space.poly(data.rate[j]) + drag[j]).tidy()
-        free += push[j] * Taylor(wide, fall.p, fall.r, fall.d)
-        forced += push[j] * Taylor(wide, b[j].p, b[j].r, b[j].d)
-    linear = space.sum(space.poly(data.gain[i]) * error[i] * Q(-1) for i in every)
-    reach = norm_squared([product_entry(data.gain, data.axes, j) for j in every])
-    where = cases_of(space, claim.limit, data.input, linear, reach, Q(-1), Q(1))
+    field = field_of(claim, x, center, (values[0][0], values[1][0], values[0][1]), place)
+    scaled = [dot(column, y) for column in zip(*adjugate, strict=True)]
+    push = pushes(field, scaled, Taylor(space, determinant).constant)
+    drag = [Taylor(space, a + dot(row, y)).tidy() for a, row in zip(data.rate, data.axes_rate, strict=True)]
+    free = pushed(push, [a - field.d * slow for a, slow in zip(field.a, drag, strict=True)])
+    forced = pushed(push, field.b)
+    linear = dot(data.gain, error) * Q(-1)
+    by_axis = [dot(data.gain, column) for column in zip(*data.axes, strict=True)]
+    where = cases_of(space, claim.limit, data.input, linear, dot(by_axis, by_axis), Q(-1), Q(1))
     inputs = {"free": space.poly(data.input) + linear, "high": claim.limit, "low": -claim.limit}
     found = {}
     for case, conditions in where.items():
         u = inputs[case]
-        total = (free + forced * (Taylor(wide, u) if case == "free" else u)) * Q(-1)
+        total = (free + forced * (Taylor(free.space, u) if case == "free" else u)) * Q(-1)
         found[case] = Obligation(total.p, total.r + total.d, Q(0), conditions, Q(-1), Q(1))
     return found
+
+
+class Field(NamedTuple):
+    """D, a and b of the robot on an ellipsoid, Taylor models."""
+
+    d: Taylor
+    a: list[Taylor]
+    b: list[Taylor]
+
+
+def field_of(claim: Claim, x: list[Taylor], center, values: tuple, place: str) -> Field:
+    """At the states x, whose angle is near `center`, with the sine and cosine and the bound of their errors there."""
+    sine, cosine = sine_and_cosine(x[claim.plant.angle], center, values, place)
+    d, a, b = claim.plant.field(claim.parameters, x, sine, cosine)
+    insist(
+        2 * d.constant - size(d.p) - d.r - d.d > 0, place, "the mass matrix' determinant is not shown to be positive"
+    )
+    return Field(d, a, b)
+
+
+def pushes(field: Field, scaled: list, determinant) -> list[Taylor]:
+    """The vector c adj(L)'y, of which `scaled` lacks the constant c."""
+    scale, _ = near(2 / (field.d.constant * determinant), 30)
+    wide = field.d.space._replace(y_order=field.d.space.y_order + 1)
+    return [Taylor(wide, each) * scale for each in scaled]
+
+
+def pushed(push: list[Taylor], field: list[Taylor]) -> Taylor:
+    """Its product with a vector."""
+    return dot(push, [Taylor(push[0].space, f.p, f.r, f.d) for f in field])
 
 
 def cases_of(space: Space, limit, feedforward, linear, reach, low, high) -> dict[str, list]:
@@ -107,8 +120,7 @@ def cases_of(space: Space, limit, feedforward, linear, reach, low, high) -> dict
     room = {"high": space.poly(limit - feedforward) - linear, "low": space.poly(limit + feedforward) + linear}
     occurs = []
     for case, left in (("high", limit - feedforward), ("low", limit + feedforward)):
-        square = plus([left * left], [-c for c in reach])
-        if not (left > 0 and is_positive(square, low, high, depth=4)):
+        if not (left > 0 and is_positive(space.poly(left * left) - reach, low, high, depth=4)):
             occurs.append(case)
     return {"free": [room[case] for case in occurs], **{case: [room[case] * Q(-1)] for case in occurs}}
 
@@ -118,11 +130,9 @@ def insist_bounds(claim: Claim, data: Motion, place: str) -> None:
     for i, bound in enumerate(claim.bounds):
         if bound is None:
             continue
-        row = norm_squared(data.axes[i])
         for sign in (1, -1):
-            left = plus([bound], [c * sign for c in data.state[i]])
-            inside = is_positive(left, Q(-1), Q(1)) and is_positive(
-                plus(times(left, left), [-c for c in row]), Q(-1), Q(1)
-            )
+            left = data.state[i] * Q(sign) + Space(claim.n, 0, 0).poly(bound)
+            room = left * left - dot(data.axes[i], data.axes[i])
+            inside = is_positive(left, Q(-1), Q(1)) and is_positive(room, Q(-1), Q(1))
             name = claim.plant.states[i]
             insist(inside, place, f"the limit |{name}| <= {float(bound):.6g} {claim.plant.units[i]} is not kept")

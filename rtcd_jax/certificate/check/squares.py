@@ -116,7 +116,7 @@ def margin(todo: Obligation, witness: Witness, place: str):
     Raises:
         Refused: the witness does not show that.
     """
-    n = len(next(iter(peakless(todo.p)))) - 1
+    n = len(next(iter(todo.p.to_dict()), (0, 0))) - 1
     basis, sides = monomials(n, witness.degree), monomials(n, witness.degree - 1)
     degree = len(witness.gram) - 1
     parts = bernstein(todo.p, degree, todo.low, todo.high, place)
@@ -132,11 +132,6 @@ def margin(todo: Obligation, witness: Witness, place: str):
         insist(rest > 0, f"{place}.gram[{j}]", f"proves no decrease: at best {float(rest):.3g}, must be > 0")
         bound = rest if bound is None else min(bound, rest)
     return bound
-
-
-def peakless(p):
-    """Exponents of a polynomial that is not zero."""
-    return p.to_dict() or {(0, 0): 0}
 
 
 def _insist_definite(matrix, rows: int, place: str) -> None:
@@ -161,14 +156,15 @@ def _subtract_product(parts, g, multiplier, basis, todo: Obligation, place: str)
                         part[h] = part.get(h, 0) - weight * c * d * k
 
 
-def is_positive(coefficients: list, low, high, depth: int = 10) -> bool:
+def is_positive(p, low, high, depth: int = 10) -> bool:
     """Whether a polynomial in s is shown to be positive on [low, high], by Bernstein coefficients and bisection."""
-    degree = len(coefficients) - 1
+    by_power = {e[0]: c for e, c in terms_of(p)}
+    degree = max(by_power, default=0)
     rows = _basis_change(degree, degree, low, high)
-    values = [sum((c * row[j] for c, row in zip(coefficients, rows, strict=True)), Q(0)) for j in range(degree + 1)]
+    values = [sum((c * rows[k][j] for k, c in by_power.items()), Q(0)) for j in range(degree + 1)]
     if min(values) > 0:
         return True
     if depth == 0 or values[0] <= 0 or values[-1] <= 0:
         return False
     middle = (low + high) / 2
-    return is_positive(coefficients, low, middle, depth - 1) and is_positive(coefficients, middle, high, depth - 1)
+    return is_positive(p, low, middle, depth - 1) and is_positive(p, middle, high, depth - 1)

@@ -1,7 +1,7 @@
 """Functions of time and of a point in the unit ball: polynomials with a bound of what they leave out."""
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from functools import lru_cache
 from typing import Any, NamedTuple
 
@@ -60,6 +60,11 @@ def peak(exponents: tuple[int, ...]):
     total = sum(exponents)
     square = math.prod((Q(e, total) ** e for e in exponents if e), start=Q(1))
     return root_up(square) if total and max(exponents) < total else Q(1)
+
+
+def derivative(n: int, p) -> Any:
+    """In s."""
+    return polynomial(n, {(e[0] - 1, *e[1:]): c * e[0] for e, c in terms_of(p) if e[0]})
 
 
 def size(p):
@@ -128,21 +133,25 @@ class Space(NamedTuple):
     y_order: int
 
     def enclose(self, a: Any) -> Taylor:
-        """A Taylor model of itself, of a polynomial, of a scalar, or of the coefficients of a polynomial in s."""
+        """A Taylor model of itself, of a polynomial or of a scalar."""
         if isinstance(a, Taylor):
             return a
-        return Taylor(self, self.poly(a) if isinstance(a, list | int | Q) else a)
+        return Taylor(self, self.poly(a) if isinstance(a, int | Q) else a)
 
     def poly(self, a: Any):
-        """The polynomial of a scalar, or of a list of coefficients of powers of s."""
-        powers = a if isinstance(a, list) else [Q(a) if isinstance(a, int) else a]
-        return polynomial(self.n, {(k, *(0,) * self.n): c for k, c in enumerate(powers) if c != 0})
+        """The polynomial of a scalar."""
+        return polynomial(self.n, {(0,) * (self.n + 1): Q(a)} if a != 0 else {})
 
-    def sum(self, polynomials: Iterable):
+    def compose(self, coefficients: Sequence, inner):
+        """The polynomial with these coefficients of the powers of another one."""
         total = self.poly(0)
-        for p in polynomials:
-            total = total + p
+        for c in reversed(coefficients):
+            total = total * inner + self.poly(c)
         return total
+
+    @property
+    def s(self):
+        return polynomial(self.n, {(1, *(0,) * self.n): Q(1)})
 
     def y(self, i: int):
         return polynomial(self.n, {(0, *(int(i == j) for j in range(self.n))): Q(1)})

@@ -10,8 +10,9 @@ from rtcd_jax.certificate.check.exact import Q, Refused, insist, root_up
 from rtcd_jax.certificate.check.file import Node, parse, read_claim, read_goal, read_stretch
 from rtcd_jax.certificate.check.funnel import Stretch, funnel_obligations, insist_bounds, motion
 from rtcd_jax.certificate.check.goal import goal_field, goal_obligations, insist_arrival
-from rtcd_jax.certificate.check.scalar import cofactors, constants, norm_squared
+from rtcd_jax.certificate.check.matrix import cofactors, dot
 from rtcd_jax.certificate.check.squares import Obligation, Witness, margin
+from rtcd_jax.certificate.check.taylor import terms_of
 
 FORMAT, VERSION = "rtcd certificate", 1
 
@@ -61,7 +62,7 @@ def check_goal(claim: Claim, node: Node, outlet: list) -> tuple[list, list, int,
     axes, order, weight, shells = read_goal(node, claim)
     for i, bound in enumerate(claim.bounds):
         left = None if bound is None else bound - abs(claim.x_goal[i])
-        kept = left is None or (left > 0 and left * left > norm_squared([[c] for c in axes[i]])[0])
+        kept = left is None or (left > 0 and left * left > dot(axes[i], axes[i]))
         insist(kept, f"{node.place}.axes", f"the limit on |{claim.plant.states[i]}| is not kept")
     field = goal_field(claim, axes, order, node.place)
     insist_arrival(claim, outlet, axes, weight, f"{node.place}.axes")
@@ -73,7 +74,7 @@ def check_goal(claim: Claim, node: Node, outlet: list) -> tuple[list, list, int,
         drift = max(drift, *(each.drift for each in todo.values()))
     rest = drift / least
     insist(rest < 1, node.place, "the rounding of the goal is too large for a proof")
-    return axes, [rest * root_up(norm_squared([[c] for c in row])[0]) for row in axes], len(shells), least
+    return axes, [rest * root_up(dot(row, row)) for row in axes], len(shells), least
 
 
 def check(content: Any, progress: Callable[[int, int], None] = lambda done, of: None) -> Report:
@@ -111,17 +112,17 @@ def volumes_of(
     ball = math.pi ** (claim.n / 2) / math.gamma(claim.n / 2 + 1)
 
     def volume(axes) -> float:
-        return ball * float(cofactors(constants(axes))[1][0])
+        return ball * float(cofactors(axes)[1])
 
     def widths(axes) -> list[float]:
-        return [float(root_up(norm_squared([[c] for c in row])[0])) for row in axes]
+        return [float(root_up(dot(row, row))) for row in axes]
 
     knots = [volume(piece.first) for piece in pieces if piece.start == 0] + [volume(pieces[-1].last)]
     integral = Q(0)
     for piece in pieces:
         data = motion(claim, piece)
-        determinant = cofactors(data.axes)[1]
-        integral += sum((c / (k + 1) for k, c in enumerate(determinant) if k % 2 == 0), Q(0)) * data.duration
+        powers = {e[0]: c for e, c in terms_of(cofactors(data.axes)[1])}
+        integral += sum((c / (k + 1) for k, c in powers.items() if k % 2 == 0), Q(0)) * data.duration
     volumes = {
         "sum": math.fsum(knots), "integral": ball * float(integral), "inlet": volume(pieces[0].first),
         "outlet": knots[-1], "goal": volume(l_goal),
