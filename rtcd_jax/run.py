@@ -1,5 +1,6 @@
 """A whole run: config -> search -> elites evaluated again -> run folder. Stops and resumes at any generation."""
 
+import math
 import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -50,7 +51,9 @@ def optimize(config: Config, folder: Path, console: Console, cluster: Cluster) -
             return
         if done:
             console.message(f"{folder}: going on after generation {done}")
-        console.message(f"compiling the evaluation of {config.search.population} candidates on {cluster}")
+        console.message(
+            f"compiling the evaluation of {config.search.population} candidates on {cluster}: a minute or so"
+        )
         again = _Again(problem, cluster, example)
         state, clock = begun, _Clock(config.search.population)
         try:
@@ -78,10 +81,11 @@ class _Clock:
         self.ends: list[float] = []
 
     def tick(self) -> tuple[float, float]:
-        """At a generation's end: seconds since the start, candidates per second."""
+        """At a generation's end: seconds since the start; candidates per second, NaN for the first one."""
         self.ends.append(time.monotonic())
-        start, count = (self.begun, 1) if len(self.ends) == 1 else (self.ends[0], len(self.ends) - 1)
-        return self.ends[-1] - self.begun, count * self.population / (self.ends[-1] - start)
+        later = len(self.ends) - 1
+        rate = later * self.population / (self.ends[-1] - self.ends[0]) if later else math.nan
+        return self.ends[-1] - self.begun, rate
 
 
 def _progress(config: Config, generation: search.Generation, clock: _Clock) -> Progress:

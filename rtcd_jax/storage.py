@@ -204,8 +204,8 @@ def read_elite(folder: Path, name: str) -> tuple[dict[str, np.ndarray], dict[str
     with reading(paths[0], _RESTORE), paths[0].open("rb") as file, np.load(file, allow_pickle=False) as stored:
         arrays = dict(stored)
     record = read_json(paths[1], _RESTORE)
-    if "status" not in record:
-        raise UserError(f"{paths[1]} lacks its status; {_RESTORE}")
+    if not record:
+        raise UserError(f"{paths[1]} says nothing of its elite; {_RESTORE}")
     return arrays, record
 
 

@@ -78,7 +78,7 @@ SITUATIONS = {
     "arrays cut": (lambda: cut("run/elites/000.npz"), "cannot read run/elites/000.npz: File is not a zip file"),
     "no arrays": (lambda: Path("run/elites/000.npz").write_bytes(b""), "cannot read run/elites/000.npz: No data left"),
     "record cut": (lambda: cut("run/elites/000.json"), "cannot read run/elites/000.json: "),
-    "record of nothing": (lambda: Path("run/elites/000.json").write_text("{}"), "000.json lacks its status"),
+    "record of nothing": (lambda: Path("run/elites/000.json").write_text("{}"), "000.json says nothing of its elite"),
     "arrays gone": (lambda: Path("run/elites/000.npz").unlink(), "run/elites has no 000.npz with its 000.json"),
 }
 

@@ -99,7 +99,7 @@ def animate_run(folder: Path, to: Path | None, seed: int, console: Console) -> l
                 add(frame)
         _write_gif(small, written[0])
     if not program:
-        console.message("no MP4: there is no ffmpeg; install it, or `pip install 'rtcd-jax[video]'`")
+        console.message("no MP4: there is no ffmpeg; install it, or `pip install -e '.[video]'`")
     for path in written:
         console.message(f"{path}, {path.stat().st_size / 1e6:.1f} MB")
     return written

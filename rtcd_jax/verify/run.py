@@ -99,6 +99,7 @@ def verify_run(folder: Path, states: int, seed: int, workers: int, console: Cons
         parts.rmdir()
     if verifications:
         console.message(_table(verifications))
+        console.message(f"stored: {', '.join(f'{folder}/verification/{name}.json' for name in verifications)}")
     return all(verification.kept for verification in verifications.values())
 
 
