@@ -29,7 +29,7 @@ import numpy as np
 from rtcd_jax import config as configuration
 from rtcd_jax.config import Config
 from rtcd_jax.errors import UserError
-from rtcd_jax.files import is_temporary, plain, read_json, reading, replace, replace_json, sync, writing
+from rtcd_jax.files import is_temporary, make_folder, plain, read_json, reading, replace, replace_json, sync, writing
 from rtcd_jax.provenance import provenance
 
 if TYPE_CHECKING:
@@ -154,8 +154,7 @@ class RunFolder:
     def write_elites(self, elites: Iterable[tuple[Arrays, Record]]) -> None:
         """All elites, best first; those that were stored beyond their number are removed."""
         folder = self.path / "elites"
-        with writing(folder):
-            folder.mkdir(exist_ok=True)
+        make_folder(folder)
         written = set()
         for index, (arrays, record) in enumerate(elites):
             written.add(f"{index:03d}")
@@ -254,8 +253,7 @@ def read_generations(path: Path) -> list[dict[str, Any]]:
 def _prepared(path: Path, config: Config) -> Iterator[None]:
     """The folder, made or recognized, locked and clean."""
     _require_run_or_nothing(path)
-    with writing(path):
-        path.mkdir(parents=True, exist_ok=True)
+    make_folder(path)
     with _locked(path):
         with writing(path):
             for leftover in path.rglob(".*.tmp"):

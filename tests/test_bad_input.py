@@ -125,6 +125,14 @@ def test_a_file_where_the_results_belong(verb, run, capsys):
     assert (run / PLACES[verb]).read_text() == "mine"
 
 
+@pytest.mark.parametrize("verb", PLACES)
+def test_a_read_only_folder_is_told_before_the_work(verb, run, capsys, monkeypatch):
+    """Asked of the system: nothing is read-only to the root that may run this."""
+    (run / PLACES[verb]).mkdir()
+    monkeypatch.setattr("rtcd_jax.files.os.access", lambda path, mode: False)
+    assert f"cannot write run/{PLACES[verb]}" in refused(command(verb), capsys)
+
+
 @contextlib.contextmanager
 def full_disk():
     """The system takes no byte more in any file, as on a disk that is full."""

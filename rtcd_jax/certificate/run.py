@@ -19,7 +19,7 @@ from scipy.stats import spearmanr
 
 from rtcd_jax.certificate.elite import Outcome, Step, certify_elite
 from rtcd_jax.console import Console
-from rtcd_jax.files import read_json, replace_json, writing
+from rtcd_jax.files import make_folder, read_json, replace_json
 from rtcd_jax.storage import require_elites
 
 POLL = 0.2
@@ -59,8 +59,7 @@ def certify_run(
     """
     names = require_elites(folder)[:elites]
     target = folder / "certificates"
-    with writing(target):
-        target.mkdir(exist_ok=True)
+    make_folder(target)
     summary = target / "summary.json"
     former = read_json(summary, "remove it, or make it again") if summary.is_file() else {}
     outcomes: dict[str, Outcome | None] = {}

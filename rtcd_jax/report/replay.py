@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float
 
 from rtcd_jax.config import Config
 from rtcd_jax.errors import UserError
-from rtcd_jax.files import replace, replace_json, writing
+from rtcd_jax.files import make_folder, replace, replace_json
 from rtcd_jax.report.canvas import BLACK, GRAY, LIGHT, WIDTH, blank, written
 from rtcd_jax.report.funnels import draw_shadows, frame, told_once, window
 from rtcd_jax.report.measured import Measured, jumps, read_measured
@@ -85,8 +85,7 @@ def replay_run(folder: Path, file: Path, elite: int | str, console: Console) -> 
     _check_time(file, measured, float(tube.elite.time[-1]))
     replay = Replay(measured, tube.fill(measured.time, measured.x), name, record)
     results, stem = folder / "replay", f"{file.stem}_{name}"
-    with writing(results):
-        results.mkdir(exist_ok=True)
+    make_folder(results)
     replace(results / f"{stem}.csv", _table(replay).encode())
     replace_json(results / f"{stem}.json", {"file": str(file), **replay.told()})
     _draw(config, Shown.of(f"funnel of {name}", VERMILION, arrays, record), replay, results, stem)

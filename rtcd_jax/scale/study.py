@@ -20,7 +20,7 @@ from rich.table import Table
 
 from rtcd_jax.config import Config, config_hash
 from rtcd_jax.console import Console
-from rtcd_jax.files import plain, replace, writing
+from rtcd_jax.files import make_folder, plain, replace, writing
 from rtcd_jax.scale.figures import draw
 
 POINTS, TABLE = "points.jsonl", "table.csv"
@@ -55,8 +55,7 @@ def study(
     that fails says why in its row, and the others go on.
     """
     mark = {"config_hash": config_hash(config), "machine": platform.node(), "repeats": repeats}
-    with writing(folder):
-        folder.mkdir(parents=True, exist_ok=True)
+    make_folder(folder)
     found = {_place(point): point for point in _kept(folder / POINTS, mark)}
     grid = [(population, count) for population in sorted(set(populations)) for count in sorted(set(devices))]
     began = time.monotonic()
