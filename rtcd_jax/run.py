@@ -19,10 +19,11 @@ from rtcd_jax.errors import UserError
 from rtcd_jax.evaluation import elite_effort, make_evaluate, resample
 from rtcd_jax.population import initial_genome
 from rtcd_jax.problem import Problem, make_problem
+from rtcd_jax.records import elite_names
 from rtcd_jax.report import report
 from rtcd_jax.results import arrays_of, record_of
 from rtcd_jax.spread import Spread, spread
-from rtcd_jax.storage import RunFolder, elite_names
+from rtcd_jax.storage import RunFolder
 from rtcd_jax.types import Evaluation, Status
 
 LAST_FILE = Path("report.html")

@@ -23,6 +23,7 @@ LAYERS = (
     {"spread"},
     {"cmaes", "elites", "loops"},
     {"search"},
+    {"records"},
     {"storage"},
     {"verify", "options", "reference", "certificate", "report"},
     {"export", "disturb"},

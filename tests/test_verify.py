@@ -15,7 +15,7 @@ from scipy.linalg import solve_continuous_are
 
 from rtcd_jax.errors import UserError
 from rtcd_jax.plants.mjx import model_of
-from rtcd_jax.storage import write_elite
+from rtcd_jax.records import write_elite
 from rtcd_jax.verify import Elite, clopper_pearson, verify_funnel, verify_run, witnesses
 from rtcd_jax.verify.simulate import simulate, tracking
 

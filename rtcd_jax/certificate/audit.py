@@ -19,7 +19,7 @@ from rtcd_jax.certificate.repair import defects, repaired
 from rtcd_jax.console import Console
 from rtcd_jax.errors import UserError
 from rtcd_jax.files import make_folder, replace_json
-from rtcd_jax.storage import write_elite
+from rtcd_jax.records import write_elite
 from rtcd_jax.verify import CLOSED_FORMS, Elite
 from rtcd_jax.verify.simulate import runge_kutta, tracking
 

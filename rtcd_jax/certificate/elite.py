@@ -17,7 +17,7 @@ from rtcd_jax.certificate.flow import Aim, Plan, best_plan
 from rtcd_jax.certificate.goal import GoalRegion, goal_region
 from rtcd_jax.certificate.loop import Loop, claim_of, double, doubles, sealed
 from rtcd_jax.files import replace, writing
-from rtcd_jax.storage import read_elite
+from rtcd_jax.records import read_elite
 
 RUNGS = ("certified", "proved")
 

@@ -20,7 +20,7 @@ from scipy.stats import spearmanr
 from rtcd_jax.certificate.elite import Outcome, Step, certify_elite
 from rtcd_jax.console import Console
 from rtcd_jax.files import make_folder, read_json, replace_json
-from rtcd_jax.storage import require_elites
+from rtcd_jax.records import require_elites
 
 POLL = 0.2
 """Seconds between looks at the workers' progress."""
@@ -152,5 +152,5 @@ def _table(outcomes: Sequence[Outcome], title: str) -> str:
             pairs["goal"],
         )
     text = io.StringIO()
-    Terminal(file=text, width=132).print(table)
+    Terminal(file=text, width=150).print(table)
     return text.getvalue().rstrip()

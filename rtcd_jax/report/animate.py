@@ -18,10 +18,10 @@ from jaxtyping import Float
 from rtcd_jax.config import Config
 from rtcd_jax.errors import UserError
 from rtcd_jax.files import make_folder, writing
+from rtcd_jax.records import read_config, read_elite, require_elites
 from rtcd_jax.report.motion import Motions, dynamics_before_mujoco, frame_times, motions
 from rtcd_jax.report.render import Camera, choose_backend
 from rtcd_jax.report.tube import Tube
-from rtcd_jax.storage import read_config, read_elite, require_elites
 
 if TYPE_CHECKING:
     from PIL.Image import Image

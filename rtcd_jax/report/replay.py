@@ -13,13 +13,13 @@ from jaxtyping import Bool, Float
 from rtcd_jax.config import Config
 from rtcd_jax.errors import UserError
 from rtcd_jax.files import make_folder, replace, replace_json
+from rtcd_jax.records import read_config, read_elite, require_elites
 from rtcd_jax.report.canvas import BLACK, GRAY, LIGHT, WIDTH, blank, written
 from rtcd_jax.report.funnels import draw_shadows, frame, told_once, window
 from rtcd_jax.report.measured import Measured, jumps, read_measured
 from rtcd_jax.report.reading import BLUE, VERMILION, Shown
 from rtcd_jax.report.shapes import planes
 from rtcd_jax.report.tube import Tube
-from rtcd_jax.storage import read_config, read_elite, require_elites
 
 LEAST = 1e-4
 """V/rho that the figure still tells from zero."""

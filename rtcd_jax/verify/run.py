@@ -20,7 +20,7 @@ from rich.table import Table
 from rtcd_jax.console import Console
 from rtcd_jax.errors import UserError
 from rtcd_jax.files import make_folder, reading, replace, replace_json, writing
-from rtcd_jax.storage import read_elite, require_elites
+from rtcd_jax.records import read_elite, require_elites
 from rtcd_jax.verify.elite import Elite
 from rtcd_jax.verify.simulate import Outcome
 from rtcd_jax.verify.verification import Trial, Verification

@@ -13,7 +13,7 @@ from rtcd_jax.disturb.contest import Progress, motions, read_contest, run
 from rtcd_jax.disturb.experiments import SCORED
 from rtcd_jax.disturb.lanes import undisturbed
 from rtcd_jax.errors import UserError
-from rtcd_jax.storage import read_elite, write_elite
+from rtcd_jax.records import read_elite, write_elite
 from rtcd_jax.verify import witnesses
 from rtcd_jax.verify.simulate import runge_kutta, simulate
 from tests.export.folders import run_folder

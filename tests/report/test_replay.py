@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from rtcd_jax.errors import UserError
+from rtcd_jax.records import write_elite
 from rtcd_jax.report.measured import columns_of, jumps, read_measured
 from rtcd_jax.report.replay import replay_run
 from rtcd_jax.report.tube import Tube
-from rtcd_jax.storage import write_elite
 from tests.report.loops import LOOPS, loop_folder, stored
 
 HEADS = {"pendulum": "time,pos,vel,torque", "cartpole": "time,pos1,pos2,vel1,vel2,tau1,tau2"}
