@@ -13,6 +13,7 @@ PACKAGE = Path(__file__).parent.parent / "rtcd_jax"
 LAYERS = (
     {"errors", "numerics", "files", "provenance", "backend"},
     {"settings", "types", "console"},
+    {"sections"},
     {"config", "sweep"},
     {"plants"},
     {"problem"},
@@ -45,7 +46,7 @@ OWNERS = {
     "matplotlib": {"report", "scale"},
     "PIL": {"report"},
     "imageio_ffmpeg": {"report"},
-    "pydantic": {"settings", "config", "options", "reference"},
+    "pydantic": {"settings", "sections", "config", "options", "reference"},
     "pydantic_core": {"settings"},
 }
 
@@ -68,6 +69,7 @@ QUICK = (
     "options.search",
     "options.run",
     "options.proof",
+    "sections",
     "settings",
     "certificate.check",
 )
