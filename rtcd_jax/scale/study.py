@@ -61,6 +61,7 @@ def study(
     began = time.monotonic()
     for index, (population, count) in enumerate(grid):
         if (population, count) not in found:
+            console.message(f"population {population}, {count} devices: a process of its own, which compiles first")
             point = mark | {"load": os.getloadavg()[0]} | _measured(path, population, count, repeats)
             with writing(folder / POINTS), (folder / POINTS).open("a") as file:
                 file.write(json.dumps(plain(point)) + "\n")
