@@ -1,7 +1,7 @@
 """The console script `rtcd`: one thin function for each verb.
 
 Exit codes: 0 done; 1 the result breaks its promise; 2 the input is wrong; 75 another process of the run has ended;
-85 the system asked to stop, and the same command goes on; 130 interrupted.
+85 the system asked to stop, and the same command goes on; 130 interrupted; 141 nobody reads the output any more.
 Nothing heavy is imported before the input is known to be right.
 """
 
@@ -15,7 +15,7 @@ from typing import Any, NoReturn
 from rtcd_jax.backend import cores, prepare_jax
 from rtcd_jax.errors import UserError, closest
 
-OK, BROKEN_PROMISE, WRONG_INPUT, LOST_PROCESS, PREEMPTED, INTERRUPTED = 0, 1, 2, 75, 85, 130
+OK, BROKEN_PROMISE, WRONG_INPUT, LOST_PROCESS, PREEMPTED, INTERRUPTED, CUT_OFF = 0, 1, 2, 75, 85, 130, 141
 RUNS = Path("checkpoints")
 
 
@@ -294,6 +294,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except UserError as error:
         print(f"rtcd: {error}", file=sys.stderr)
         return WRONG_INPUT
+    except BrokenPipeError:  # the reader, say `head`, has had enough
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return CUT_OFF
     except OSError as error:  # no bug's: a path that may not be read, a disk that is full
         where = f"{error.filename}: " if error.filename else ""
         print(f"rtcd: {where}{error.strerror or error}", file=sys.stderr)

@@ -15,9 +15,9 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from rtcd_jax import rollout
-from rtcd_jax.config import FunnelConfig
 from rtcd_jax.numerics import sampling
 from rtcd_jax.numerics.ellipsoid import Ellipsoids
+from rtcd_jax.sections import FunnelConfig
 
 SAFETY = 0.98
 """Level over that of the lowest fresh state that failed."""

@@ -26,7 +26,8 @@ class Progress:
     """One generation. Volumes are of the `sampled` rung, in the product of the states' units.
 
     `best` is the best so far, `median` this generation's among the feasible; NaN where there is none.
-    `feasible` is a share in [0, 1], `rate` in candidates a second, `elapsed` and `left` in seconds;
+    `feasible` is a share in [0, 1], `rate` in candidates a second, `elapsed` and `left` in seconds; `rate` and `left`
+    are NaN for a generation that compiled.
     `failures` counts this generation's candidates without a funnel by the name of their status.
     """
 
@@ -54,7 +55,7 @@ class Progress:
             f"best {_volume(self.best)} (sampled)",
             f"median {_volume(self.median)}",
             f"feasible {self.feasible:4.0%}",
-            f"{self.rate:.3g} candidates/s",
+            "compiled" if math.isnan(self.rate) else f"{self.rate:.3g} candidates/s",
             f"elapsed {_duration(self.elapsed)}",
             f"left {_duration(self.left)}",
         ]

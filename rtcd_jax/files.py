@@ -1,6 +1,7 @@
 """Files that are replaced as a whole, and whose errors name them."""
 
 import contextlib
+import errno
 import json
 import math
 import os
@@ -27,6 +28,14 @@ def plain(value: Any) -> Any:
     if value is None or isinstance(value, str | int):
         return value
     raise TypeError(f"JSON has no {type(value).__name__}: {value!r}")
+
+
+def make_folder(path: Path) -> None:
+    """Makes a folder, with its parents, where it is not there. Raises `UserError` if nothing can be written into it."""
+    with writing(path):
+        path.mkdir(parents=True, exist_ok=True)
+        if not os.access(path, os.W_OK):  # known before the work, not after it
+            raise PermissionError(errno.EACCES, "it is read-only")
 
 
 def replace_json(path: Path, record: Mapping[str, Any]) -> None:

@@ -9,14 +9,15 @@ from typing import Any, Literal, Union, get_args, get_origin
 
 from pydantic.fields import FieldInfo
 
-from rtcd_jax.config import PLANTS, UNIT, Config, PlantConfig, Variable
+from rtcd_jax.config import Config
 from rtcd_jax.files import replace
+from rtcd_jax.sections import PLANTS, UNIT, PlantConfig, Variable
 from rtcd_jax.settings import Settings, bounds
 
 HEAD = """\
 # Every key of a configuration
 
-Made from the models in `rtcd_jax/config.py` by `python -m rtcd_jax.reference docs/config.md`. Every key is also an
+Made from the models in `rtcd_jax/sections.py` by `python -m rtcd_jax.reference docs/config.md`. Every key is also an
 option of `rtcd optimize CONFIG`, as `--search.population 256`; with `--help` it lists them with the file's own values.
 All numbers are in SI units, angles in rad; `-` is a number without unit. "the paper" is Girlanda et al., ICRA 2024.
 """

@@ -1,5 +1,6 @@
 """A whole run: config -> search -> elites evaluated again -> run folder. Stops and resumes at any generation."""
 
+import math
 import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -18,10 +19,11 @@ from rtcd_jax.errors import UserError
 from rtcd_jax.evaluation import elite_effort, make_evaluate, resample
 from rtcd_jax.population import initial_genome
 from rtcd_jax.problem import Problem, make_problem
+from rtcd_jax.records import elite_names
 from rtcd_jax.report import report
 from rtcd_jax.results import arrays_of, record_of
 from rtcd_jax.spread import Spread, spread
-from rtcd_jax.storage import RunFolder, elite_names
+from rtcd_jax.storage import RunFolder
 from rtcd_jax.types import Evaluation, Status
 
 LAST_FILE = Path("report.html")
@@ -50,7 +52,9 @@ def optimize(config: Config, folder: Path, console: Console, cluster: Cluster) -
             return
         if done:
             console.message(f"{folder}: going on after generation {done}")
-        console.message(f"compiling the evaluation of {config.search.population} candidates on {cluster}")
+        console.message(
+            f"compiling the evaluation of {config.search.population} candidates on {cluster}: a minute or so"
+        )
         again = _Again(problem, cluster, example)
         state, clock = begun, _Clock(config.search.population)
         try:
@@ -78,10 +82,11 @@ class _Clock:
         self.ends: list[float] = []
 
     def tick(self) -> tuple[float, float]:
-        """At a generation's end: seconds since the start, candidates per second."""
+        """At a generation's end: seconds since the start; candidates per second, NaN for the first one."""
         self.ends.append(time.monotonic())
-        start, count = (self.begun, 1) if len(self.ends) == 1 else (self.ends[0], len(self.ends) - 1)
-        return self.ends[-1] - self.begun, count * self.population / (self.ends[-1] - start)
+        later = len(self.ends) - 1
+        rate = later * self.population / (self.ends[-1] - self.ends[0]) if later else math.nan
+        return self.ends[-1] - self.begun, rate
 
 
 def _progress(config: Config, generation: search.Generation, clock: _Clock) -> Progress:

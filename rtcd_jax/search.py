@@ -22,10 +22,10 @@ from jaxtyping import Array, Float, Int, Key
 
 from rtcd_jax import cmaes, elites
 from rtcd_jax.cmaes import Stop
-from rtcd_jax.config import ElitesConfig, SearchConfig
 from rtcd_jax.elites import Elites, Evaluated
 from rtcd_jax.errors import UserError
 from rtcd_jax.loops import Joint, Nested, NestedState
+from rtcd_jax.sections import ElitesConfig, SearchConfig
 from rtcd_jax.types import Evaluation, Status
 
 Evaluate = Callable[[Float[Array, "P d"], Key[Array, ""]], Evaluated]

@@ -1,26 +1,22 @@
-"""The run folder: what a run leaves behind, and all that it needs to go on after a kill at any moment.
+"""The run folder as a run holds it: locked, with all that it needs to go on after a kill at any moment.
 
-    format.json                the mark of a run folder and its format's version
-    config.yaml                the resolved configuration
+Beside the files of records.py, process 0 writes
+
     provenance.json            versions, device, commit and working time of every start of the run
-    generations.jsonl          one line a generation, flushed at once
     state/                     checkpoints of the search, the latest two
-    initial.npz, initial.json  the configuration's initial candidate
-    elites/NNN.npz, NNN.json   the best candidates, 000 first
 
-Every file but the JSON lines is replaced as a whole; the lines are cut back to the checkpoint at a resume. Numbers that
-are not finite are stored as null. Reading needs neither JAX nor orbax, which are imported where states are kept.
+Every file but the JSON lines is replaced as a whole; the lines are cut back to the checkpoint at a resume. Orbax and
+JAX are imported where states are kept.
 """
 
 import contextlib
 import fcntl
-import io
 import itertools
 import json
 import os
 import socket
 import time
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self, TypeVar, final
 
@@ -29,22 +25,27 @@ import numpy as np
 from rtcd_jax import config as configuration
 from rtcd_jax.config import Config
 from rtcd_jax.errors import UserError
-from rtcd_jax.files import is_temporary, plain, read_json, reading, replace, replace_json, sync, writing
+from rtcd_jax.files import is_temporary, make_folder, plain, read_json, reading, replace, replace_json, sync, writing
 from rtcd_jax.provenance import provenance
+from rtcd_jax.records import (
+    FORMAT,
+    VERSION,
+    Arrays,
+    Record,
+    elite_names,
+    require_format,
+    stored_config,
+    write_elite,
+)
 
 if TYPE_CHECKING:
     from rtcd_jax.cluster import Cluster
 
-FORMAT = "rtcd_jax run"
-VERSION = 1
 KEPT_STATES = 2
 _LOCK = ".lock"
-_RESTORE = "restore it, or make the run again"
 _FORGET = "restore it, or remove it: the run then goes on without its history"
 
 State = TypeVar("State")
-Arrays = Mapping[str, np.ndarray]
-Record = Mapping[str, Any]
 
 
 @final
@@ -154,8 +155,7 @@ class RunFolder:
     def write_elites(self, elites: Iterable[tuple[Arrays, Record]]) -> None:
         """All elites, best first; those that were stored beyond their number are removed."""
         folder = self.path / "elites"
-        with writing(folder):
-            folder.mkdir(exist_ok=True)
+        make_folder(folder)
         written = set()
         for index, (arrays, record) in enumerate(elites):
             written.add(f"{index:03d}")
@@ -177,85 +177,11 @@ class RunFolder:
             os.truncate(self._lines_path, sum(complete))
 
 
-def write_elite(folder: Path, name: str, arrays: Arrays, record: Record) -> None:
-    """Writes NAME.npz, then NAME.json; equal contents give equal bytes.
-
-    Raises TypeError for an array or a value that other programs could not read.
-    """
-    for key, array in arrays.items():
-        if not isinstance(array, np.ndarray) or array.dtype.kind not in "fiub":
-            raise TypeError(f"{name}.npz: {key} must be a numpy array of numbers, got {type(array).__name__}")
-    file = io.BytesIO()
-    np.savez(file, **arrays)  # type: ignore[arg-type]
-    replace(folder / f"{name}.npz", file.getvalue())
-    replace_json(folder / f"{name}.json", record)
-
-
-def read_elite(folder: Path, name: str) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-    """The arrays and the record of `folder`/NAME.
-
-    Raises:
-        UserError: it is not there (the error has the names that are), or one of its files is damaged.
-    """
-    paths = [folder / f"{name}.{suffix}" for suffix in ("npz", "json")]
-    if not all(path.is_file() for path in paths):
-        there = ", ".join(sorted(path.stem for path in folder.glob("*.npz"))) or "nothing"
-        raise UserError(f"{folder} has no {name}.npz with its {name}.json; there is {there}")
-    with reading(paths[0], _RESTORE), paths[0].open("rb") as file, np.load(file, allow_pickle=False) as stored:
-        arrays = dict(stored)
-    record = read_json(paths[1], _RESTORE)
-    if "status" not in record:
-        raise UserError(f"{paths[1]} lacks its status; {_RESTORE}")
-    return arrays, record
-
-
-def elite_names(path: Path) -> list[str]:
-    """Names of the elites in a run folder, best first."""
-    return sorted((file.stem for file in (path / "elites").glob("*.json") if file.stem.isdecimal()), key=int)
-
-
-def require_elites(path: Path) -> list[str]:
-    """`elite_names` of a run folder. Raises UserError if it is none, or its search is not finished."""
-    names = elite_names(path)
-    if not names:
-        _require_run(path)
-        raise UserError(f"{path} has no elites yet: finish the run first, by the command that began it")
-    return names
-
-
-def read_config(path: Path) -> Config:
-    """The configuration of a run. Raises UserError if the folder is no run folder that this version reads."""
-    _require_run(path)
-    _require_format(path)
-    return _stored_config(path)
-
-
-def _require_run(path: Path) -> None:
-    if not (path / "format.json").is_file():
-        raise UserError(f"{path} is no run folder: it has no format.json")
-
-
-def read_generations(path: Path) -> list[dict[str, Any]]:
-    """The generations of a run, null for what was not finite; a torn last line is left out.
-
-    Raises UserError, with the line, if another one is damaged.
-    """
-    lines = path / "generations.jsonl"
-    found = []
-    with reading(lines, _RESTORE), lines.open("rb") as file:
-        for number, line in enumerate(file, 1):
-            if line.endswith(b"\n"):
-                with reading(Path(f"{lines}, line {number}"), _RESTORE):
-                    found.append(dict(json.loads(line)))
-    return found
-
-
 @contextlib.contextmanager
 def _prepared(path: Path, config: Config) -> Iterator[None]:
     """The folder, made or recognized, locked and clean."""
     _require_run_or_nothing(path)
-    with writing(path):
-        path.mkdir(parents=True, exist_ok=True)
+    make_folder(path)
     with _locked(path):
         with writing(path):
             for leftover in path.rglob(".*.tmp"):
@@ -281,31 +207,14 @@ def _claim(path: Path, config: Config) -> None:
     """Writes format.json and config.yaml, or checks those that are there. format.json first: it marks the folder."""
     if not (path / "format.json").is_file():
         replace_json(path / "format.json", {"format": FORMAT, "version": VERSION})
-    _require_format(path)
+    require_format(path)
     if not (path / "config.yaml").is_file():
         replace(path / "config.yaml", configuration.dump(config).encode())
-    changed = configuration.differences(_stored_config(path), config)
+    changed = configuration.differences(stored_config(path), config)
     if changed:
         keys = [f"  {key}: {old!r} in the folder, {new!r} now" for key, (old, new) in changed.items()]
         head = f"{path} holds a run with another configuration; choose another folder, or set back"
         raise UserError("\n".join([head, *keys]))
-
-
-def _require_format(path: Path) -> None:
-    file = path / "format.json"
-    mark = read_json(file, "choose another folder")
-    name, version = mark.get("format"), mark.get("version")
-    if (name, version) != (FORMAT, VERSION):
-        raise UserError(
-            f"{file} says {name!r}, version {version!r}, but this rtcd_jax reads {FORMAT!r}, version {VERSION}: "
-            "go on with the version in provenance.json, or choose another folder"
-        )
-
-
-def _stored_config(path: Path) -> Config:
-    file = path / "config.yaml"
-    with reading(file, _RESTORE):
-        return configuration.parse_yaml(file.read_bytes(), str(file))
 
 
 def _add_start(path: Path, config: Config) -> None:

@@ -27,7 +27,7 @@ from rich.table import Table
 
 from rtcd_jax.config import Config, parse, read_yaml
 from rtcd_jax.errors import ConfigError, Problem, UserError, closest
-from rtcd_jax.files import read_json, reading, replace, writing
+from rtcd_jax.files import make_folder, read_json, reading, replace
 
 TABLE = "table.csv"
 WAYS = ("product", "zip")
@@ -131,8 +131,7 @@ def show(cases: Sequence[Case], folder: Path) -> str:
     writer = csv.DictWriter(text, list(rows[0]), lineterminator="\n")
     writer.writeheader()
     writer.writerows(rows)
-    with writing(folder):
-        folder.mkdir(parents=True, exist_ok=True)
+    make_folder(folder)
     replace(folder / TABLE, text.getvalue().encode())
     table = Table(box=SIMPLE, title="volumes are of the sampled rung")
     for heading in ("case", *cases[0].values, "generations", "initial", "best", "ratio"):

@@ -78,7 +78,7 @@ SITUATIONS = {
     "arrays cut": (lambda: cut("run/elites/000.npz"), "cannot read run/elites/000.npz: File is not a zip file"),
     "no arrays": (lambda: Path("run/elites/000.npz").write_bytes(b""), "cannot read run/elites/000.npz: No data left"),
     "record cut": (lambda: cut("run/elites/000.json"), "cannot read run/elites/000.json: "),
-    "record of nothing": (lambda: Path("run/elites/000.json").write_text("{}"), "000.json lacks its status"),
+    "record of nothing": (lambda: Path("run/elites/000.json").write_text("{}"), "000.json says nothing of its elite"),
     "arrays gone": (lambda: Path("run/elites/000.npz").unlink(), "run/elites has no 000.npz with its 000.json"),
 }
 
@@ -123,6 +123,14 @@ def test_a_file_where_the_results_belong(verb, run, capsys):
     (run / PLACES[verb]).write_text("mine")
     assert f"cannot write run/{PLACES[verb]}" in refused(command(verb), capsys)
     assert (run / PLACES[verb]).read_text() == "mine"
+
+
+@pytest.mark.parametrize("verb", PLACES)
+def test_a_read_only_folder_is_told_before_the_work(verb, run, capsys, monkeypatch):
+    """Asked of the system: nothing is read-only to the root that may run this."""
+    (run / PLACES[verb]).mkdir()
+    monkeypatch.setattr("rtcd_jax.files.os.access", lambda path, mode: False)
+    assert f"cannot write run/{PLACES[verb]}" in refused(command(verb), capsys)
 
 
 @contextlib.contextmanager

@@ -235,6 +235,21 @@ def test_verify_exits_by_the_promise(monkeypatch, tmp_path, held, code):
     assert calls == [(tmp_path, 10, 3)]
 
 
+def test_a_page_that_cannot_be_brought_up_to_date_ends_nothing(monkeypatch, tmp_path, capsys):
+    module = types.ModuleType("rtcd_jax.verify")
+    module.verify_run = lambda *_: True
+    monkeypatch.setitem(sys.modules, "rtcd_jax.verify", module)
+    monkeypatch.setattr(cli, "prepare_jax", lambda *_: None)
+    assert cli.main(["verify", str(tmp_path)]) == 0
+    assert capsys.readouterr().out == ""
+    (tmp_path / "report.html").touch()
+    assert cli.main(["verify", str(tmp_path)]) == 0
+    told = capsys.readouterr().out
+    assert (
+        told == f"{tmp_path}/report.html does not show this yet: {tmp_path} is no run folder: it has no format.json\n"
+    )
+
+
 @pytest.mark.parametrize(("kept", "code"), [(True, 0), (False, 1)])
 def test_replay_exits_by_the_funnel(monkeypatch, tmp_path, kept, code):
     calls = []

@@ -11,9 +11,7 @@ import yaml
 from rtcd_jax import plants
 from rtcd_jax.config import (
     EXAMPLE,
-    PLANTS,
     Config,
-    Variable,
     config_hash,
     differences,
     dump,
@@ -23,6 +21,7 @@ from rtcd_jax.config import (
     resolved,
 )
 from rtcd_jax.errors import ConfigError
+from rtcd_jax.sections import PLANTS, Variable
 
 CONFIGS = Path(__file__).parent.parent / "configs"
 REMOVED = object()

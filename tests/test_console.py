@@ -66,6 +66,10 @@ def test_durations(seconds, shown):
     assert f"left {shown}  failed" in str(replace(NOW, left=seconds))
 
 
+def test_a_generation_that_compiled_says_nothing_of_the_others():
+    assert "compiled  elapsed 0:12  left unknown" in str(replace(NOW, rate=math.nan, left=math.nan))
+
+
 def test_nothing_feasible_yet():
     assert "best none (sampled)  median none  feasible   0%" in str(
         replace(NOW, best=math.nan, median=math.nan, feasible=0)

@@ -13,6 +13,7 @@ PACKAGE = Path(__file__).parent.parent / "rtcd_jax"
 LAYERS = (
     {"errors", "numerics", "files", "provenance", "backend"},
     {"settings", "types", "console", "workers"},
+    {"sections"},
     {"config", "sweep"},
     {"plants"},
     {"problem"},
@@ -23,6 +24,7 @@ LAYERS = (
     {"spread"},
     {"cmaes", "elites", "loops"},
     {"search"},
+    {"records"},
     {"storage"},
     {"verify", "options", "reference", "certificate", "report"},
     {"export", "disturb"},
@@ -44,7 +46,7 @@ OWNERS = {
     "matplotlib": {"report", "scale"},
     "PIL": {"report"},
     "imageio_ffmpeg": {"report"},
-    "pydantic": {"settings", "config", "options", "reference"},
+    "pydantic": {"settings", "sections", "config", "options", "reference"},
     "pydantic_core": {"settings"},
 }
 
@@ -68,6 +70,7 @@ QUICK = (
     "options.search",
     "options.run",
     "options.proof",
+    "sections",
     "settings",
     "certificate.check",
 )

@@ -5,8 +5,9 @@ from pathlib import Path
 
 import pytest
 
-from rtcd_jax.config import PLANTS, load, resolved
+from rtcd_jax.config import load, resolved
 from rtcd_jax.reference import reference
+from rtcd_jax.sections import PLANTS
 
 ROOT = Path(__file__).parent.parent
 ROW = re.compile(r"\| `(\S+)` \| (.*?) \| (.*?) \| (.*?) \| (.+) \|$", re.MULTILINE)

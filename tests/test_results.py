@@ -11,8 +11,8 @@ import scipy.stats
 from rtcd_jax.config import config_hash
 from rtcd_jax.evaluation import elite_effort
 from rtcd_jax.files import plain
+from rtcd_jax.records import write_elite
 from rtcd_jax.results import arrays_of, epsilon, record_of
-from rtcd_jax.storage import write_elite
 from rtcd_jax.verify import Elite
 from tests import pipeline
 

@@ -22,8 +22,8 @@ from rtcd_jax import run
 from rtcd_jax.cluster import Cluster
 from rtcd_jax.console import Console
 from rtcd_jax.errors import UserError
+from rtcd_jax.records import elite_names, read_elite, read_generations
 from rtcd_jax.run import LAST_FILE
-from rtcd_jax.storage import elite_names, read_elite, read_generations
 from rtcd_jax.types import Status
 from tests.fake_evaluation import bowl, population
 

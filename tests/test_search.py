@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from rtcd_jax import cmaes, elites, search
-from rtcd_jax.config import ElitesConfig, NestedConfig, SearchConfig
 from rtcd_jax.loops import Nested
 from rtcd_jax.search import NothingFeasible, Plan
+from rtcd_jax.sections import ElitesConfig, NestedConfig, SearchConfig
 from rtcd_jax.types import Status
 from tests.fake_evaluation import bowl, population
 

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from rtcd_jax import config as configuration
-from rtcd_jax import files, search, storage
+from rtcd_jax import files, records, search, storage
 from rtcd_jax.errors import UserError
 from rtcd_jax.storage import RunFolder
 from tests.fake_evaluation import bowl
@@ -119,7 +119,7 @@ def test_lines_after_the_saved_generation_and_a_torn_one_are_cut(tmp_path, gener
         file.write(b'{"index": 9, "evalua')
     with RunFolder.open(tmp_path / "torn", config) as folder:
         assert folder.restore(begin(plan)).generation == generations
-        assert [line["index"] for line in storage.read_generations(folder.path)] == list(range(generations))
+        assert [line["index"] for line in records.read_generations(folder.path)] == list(range(generations))
     drive(tmp_path / "torn", config)
     assert results(tmp_path / "torn") == results(tmp_path / "whole")
 
@@ -200,22 +200,6 @@ def test_saves_are_no_closer_than_the_configured_seconds(tmp_path, monkeypatch):
             assert folder.save_if_due({"a": jnp.zeros(2)}, int(100 * elapsed)) == saved
 
 
-def test_an_elite_is_read_back_as_it_was_written_and_equal_contents_give_equal_bytes(tmp_path):
-    arrays = {"rho": np.array([0.1, np.inf]), "x": np.arange(6.0).reshape(3, 2), "trials": np.array([3])}
-    record = {"rung": "sampled", "volume": 0.1 + 0.2, "bad": float("nan"), "array": np.array([1.5, -np.inf])}
-    storage.write_elite(tmp_path, "000", arrays, record)
-    first = [(tmp_path / name).read_bytes() for name in ("000.npz", "000.json")]
-    time.sleep(0.01)
-    storage.write_elite(tmp_path, "000", arrays, record)
-    assert first == [(tmp_path / name).read_bytes() for name in ("000.npz", "000.json")]
-    loaded, read = storage.read_elite(tmp_path, "000")
-    assert loaded.keys() == arrays.keys()
-    assert all(np.array_equal(loaded[key], arrays[key]) and loaded[key].dtype == arrays[key].dtype for key in arrays)
-    assert read == {"rung": "sampled", "volume": 0.1 + 0.2, "bad": None, "array": [1.5, None]}
-    assert "NaN" not in (tmp_path / "000.json").read_text()
-    assert len((tmp_path / "000.json").read_text().splitlines()) > len(record)
-
-
 def test_fewer_elites_replace_more_and_the_initial_candidate_has_their_format(tmp_path):
     def elites(count):
         return [({"genome": np.full(2, k)}, {"rank": k}) for k in range(count)]
@@ -223,7 +207,7 @@ def test_fewer_elites_replace_more_and_the_initial_candidate_has_their_format(tm
     with RunFolder.open(tmp_path / "run", experiment()) as folder:
         folder.write_initial({"genome": np.zeros(2)}, {"rank": None})
         folder.write_elites(elites(12))
-        assert storage.elite_names(folder.path) == [f"{k:03d}" for k in range(12)]
+        assert records.elite_names(folder.path) == [f"{k:03d}" for k in range(12)]
         folder.write_elites(elites(2))
     assert {file.name for file in (tmp_path / "run" / "elites").iterdir()} == {
         "000.npz",
@@ -231,15 +215,15 @@ def test_fewer_elites_replace_more_and_the_initial_candidate_has_their_format(tm
         "001.npz",
         "001.json",
     }
-    assert storage.read_elite(tmp_path / "run", "initial")[1] == {"rank": None}
-    assert storage.read_elite(tmp_path / "run" / "elites", "001")[1] == {"rank": 1}
+    assert records.read_elite(tmp_path / "run", "initial")[1] == {"rank": None}
+    assert records.read_elite(tmp_path / "run" / "elites", "001")[1] == {"rank": 1}
 
 
 def test_the_folder_tells_its_configuration_and_every_start(tmp_path):
     config = experiment()
     for _ in range(2):
         RunFolder.open(tmp_path / "run", config).close()
-    assert storage.read_config(tmp_path / "run") == config
+    assert records.read_config(tmp_path / "run") == config
     told = json.loads((tmp_path / "run" / "provenance.json").read_text())
     assert told["config_hash"] == configuration.config_hash(config)
     first, second = told["starts"]
@@ -294,7 +278,7 @@ def test_a_file_in_the_place_of_the_folder_is_refused(tmp_path):
 
 def test_an_empty_folder_is_taken(tmp_path):
     RunFolder.open(tmp_path, experiment()).close()
-    assert storage.read_config(tmp_path) == experiment()
+    assert records.read_config(tmp_path) == experiment()
 
 
 def test_a_folder_that_cannot_be_created_is_named(tmp_path):
@@ -335,12 +319,7 @@ def test_another_format_is_refused(tmp_path, content, message):
     (tmp_path / "run" / "format.json").write_text(content)
     assert message in refused(tmp_path / "run")
     with pytest.raises(UserError, match=r"format\.json"):
-        storage.read_config(tmp_path / "run")
-
-
-def test_a_folder_without_the_mark_is_no_run(tmp_path):
-    with pytest.raises(UserError, match=r"is no run folder: it has no format\.json"):
-        storage.read_config(tmp_path)
+        records.read_config(tmp_path / "run")
 
 
 def test_a_damaged_configuration_is_named(tmp_path):
@@ -417,36 +396,3 @@ def test_a_disk_that_is_really_full_ends_a_run_with_the_path_and_no_hang(tmp_pat
     lines = done.stdout.splitlines()
     assert lines[0] == f"append cannot write {tmp_path}/run/generations.jsonl: File too large", done.stderr
     assert lines[1].startswith(f"save cannot write {tmp_path}/run/state: "), done.stderr
-
-
-@pytest.mark.parametrize("value", [[1.0], np.array(["a"]), np.array([None])])
-def test_arrays_that_others_cannot_read_are_refused(tmp_path, value):
-    with pytest.raises(TypeError, match=r"000\.npz: rho must be a numpy array of numbers"):
-        storage.write_elite(tmp_path, "000", {"rho": value}, {})
-
-
-def test_values_that_json_does_not_have_are_refused(tmp_path):
-    with pytest.raises(TypeError, match="JSON has no set"):
-        storage.write_elite(tmp_path, "000", {}, {"a": {1}})
-
-
-def test_a_missing_elite_is_refused_with_those_that_are_there(tmp_path):
-    storage.write_elite(tmp_path, "000", {}, {})
-    with pytest.raises(UserError, match=r"has no 007\.npz with its 007\.json; there is 000"):
-        storage.read_elite(tmp_path, "007")
-
-
-@pytest.mark.parametrize("suffix", ["npz", "json"])
-@pytest.mark.parametrize("kept", [0, 40])
-def test_a_damaged_elite_is_refused_by_its_file(tmp_path, suffix, kept):
-    storage.write_elite(tmp_path, "000", {"rho": np.arange(9.0)}, {"text": "a" * 50})
-    damaged = tmp_path / f"000.{suffix}"
-    damaged.write_bytes(damaged.read_bytes()[:kept])
-    with pytest.raises(UserError, match=rf"cannot read .*000\.{suffix}: .*restore it"):
-        storage.read_elite(tmp_path, "000")
-
-
-def test_reading_a_run_imports_neither_jax_nor_orbax():
-    code = "import sys, rtcd_jax.storage; print({'jax', 'orbax'} & set(sys.modules))"
-    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
-    assert done.stdout == "set()\n"

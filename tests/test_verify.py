@@ -15,7 +15,7 @@ from scipy.linalg import solve_continuous_are
 
 from rtcd_jax.errors import UserError
 from rtcd_jax.plants.mjx import model_of
-from rtcd_jax.storage import write_elite
+from rtcd_jax.records import write_elite
 from rtcd_jax.verify import Elite, clopper_pearson, verify_funnel, verify_run, witnesses
 from rtcd_jax.verify.simulate import simulate, tracking
 
@@ -341,8 +341,9 @@ def test_the_same_seed_gives_the_same_states():
 
 
 def test_verify_run_refuses_what_is_no_finished_run(tmp_path):
-    with pytest.raises(UserError, match="nowhere is no run folder: it does not exist"):
+    with pytest.raises(UserError, match=r"nowhere is no run folder: it has no format\.json"):
         verify_run(tmp_path / "nowhere", 60, 0, 1, _Listener())
+    (tmp_path / "format.json").touch()
     with pytest.raises(UserError, match="has no elites yet: finish the run first"):
         verify_run(tmp_path, 60, 0, 1, _Listener())
     _store(tmp_path / "elites", "000", _held(HELD))

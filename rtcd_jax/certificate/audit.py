@@ -18,8 +18,8 @@ from rtcd_jax.certificate.outside import Cost, Outside, elite_of
 from rtcd_jax.certificate.repair import defects, repaired
 from rtcd_jax.console import Console
 from rtcd_jax.errors import UserError
-from rtcd_jax.files import replace_json, writing
-from rtcd_jax.storage import write_elite
+from rtcd_jax.files import make_folder, replace_json
+from rtcd_jax.records import write_elite
 from rtcd_jax.verify import CLOSED_FORMS, Elite
 from rtcd_jax.verify.simulate import runge_kutta, tracking
 
@@ -69,8 +69,7 @@ def audit(given: Outside, cost: Cost, states: int, seed: int, out: Path, console
     off = np.max(np.abs(defects(given)), axis=0)
     mended = repaired(given, cost)
     replace_json(out / RECORD, _record(given, mended, seen, off, states, seed))
-    with writing(out):
-        (out / "elites").mkdir(exist_ok=True)
+    make_folder(out / "elites")
     for name, outside in (("000", mended), ("001", given)):
         write_elite(out / "elites", name, *elite_of(outside, cost))
     console.message(_table(given, seen))
@@ -84,8 +83,7 @@ def _claim(out: Path) -> None:
     foreign = sorted(item.name for item in out.iterdir()) if out.is_dir() and not (out / RECORD).is_file() else []
     if foreign:
         raise UserError(f"--out = {out}: must be a new or empty folder, or a former audit's: it has {foreign[0]}")
-    with writing(out):
-        out.mkdir(parents=True, exist_ok=True)
+    make_folder(out)
 
 
 def _record(given: Outside, mended: Outside, seen: Escapes, off: np.ndarray, states: int, seed: int) -> dict[str, Any]:

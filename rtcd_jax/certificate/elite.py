@@ -16,7 +16,7 @@ from rtcd_jax.certificate.journal import Journal
 from rtcd_jax.certificate.levels import directions, leveled
 from rtcd_jax.certificate.loop import Loop, claim_of, double, doubles, sealed
 from rtcd_jax.files import replace
-from rtcd_jax.storage import read_elite
+from rtcd_jax.records import read_elite
 
 RUNGS = ("certified", "proved")
 COARSER = 2

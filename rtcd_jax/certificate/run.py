@@ -18,8 +18,8 @@ from scipy.stats import spearmanr
 
 from rtcd_jax.certificate.elite import Outcome, Step, certify_elite
 from rtcd_jax.console import Console
-from rtcd_jax.files import replace_json, writing
-from rtcd_jax.storage import require_elites
+from rtcd_jax.files import make_folder, read_json, replace_json
+from rtcd_jax.records import require_elites
 from rtcd_jax.workers import CONTEXT, processes
 
 POLL = 0.2
@@ -59,8 +59,9 @@ def certify_run(
     """
     names = require_elites(folder)[:elites]
     target = folder / "certificates"
-    with writing(target):
-        target.mkdir(exist_ok=True)
+    make_folder(target)
+    summary = target / "summary.json"
+    former = read_json(summary, "remove it, or make it again") if summary.is_file() else {}
     outcomes: dict[str, Outcome | None] = {}
     began, reached = time.monotonic(), dict.fromkeys(names, 0.0)
     for event in _events(folder, names, rung, workers, optimize_value):
@@ -70,7 +71,7 @@ def certify_run(
             console.progress(Progress(done, 1000, event, time.monotonic() - began))
         else:
             outcomes[event[0]] = event[1]
-    replace_json(target / "summary.json", {name: _summary(outcomes[name]) for name in names})
+    replace_json(summary, former | {name: _summary(outcomes[name]) for name in names})
     finished = [outcome for name in names if (outcome := outcomes[name]) is not None]
     beside = "/".join(dict.fromkeys(outcome.beside for outcome in finished)) or "sampled"
     console.message(_table(finished, f"volumes: {beside} / {rung}"))
@@ -80,6 +81,9 @@ def certify_run(
     for name in names:
         if outcomes[name] is None:
             console.message(f"{name}: no goal region can be shown at any level that was tried")
+    for outcome in finished:
+        file = target / f"{outcome.elite}.json"
+        console.message(f"stored: {file}; `rtcd check {file}` checks it")
     return all(outcome is not None and outcome.whole for outcome in outcomes.values())
 
 
@@ -143,5 +147,5 @@ def _table(outcomes: Sequence[Outcome], title: str) -> str:
             pairs["goal"],
         )
     text = io.StringIO()
-    Terminal(file=text, width=132).print(table)
+    Terminal(file=text, width=150).print(table)
     return text.getvalue().rstrip()

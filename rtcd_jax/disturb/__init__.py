@@ -12,7 +12,7 @@ from typing import Any
 from rtcd_jax.disturb.contest import Console, Contest, Meter, motions, read_contest, run
 from rtcd_jax.disturb.experiments import FACTORS, SIZES, TIMES, impulse, off_nominal, robustness, troubles
 from rtcd_jax.disturb.lanes import Lanes, Outcome
-from rtcd_jax.files import replace_json, writing
+from rtcd_jax.files import make_folder, replace_json
 from rtcd_jax.report.disturbance import draw_disturbance
 
 FOLDER = "disturbance"
@@ -26,8 +26,7 @@ def disturb_run(folder: Path, states: int, seed: int, console: Console) -> None:
     """
     contest = read_contest(folder, console)
     place = folder / FOLDER
-    with writing(place):
-        place.mkdir(exist_ok=True)
+    make_folder(place)
     meter = Meter(console, _all_motions(contest, states))
 
     def simulate(lanes: Lanes, experiment: str, settles: bool) -> Outcome:

@@ -26,12 +26,14 @@ from rtcd_jax.errors import UserError
 from rtcd_jax.plants import plant_class
 from rtcd_jax.plants.base import Plant
 from rtcd_jax.plants.mjx import CpuDynamics, model_of
-from rtcd_jax.storage import read_elite, require_elites
+from rtcd_jax.records import read_elite, require_elites
 from rtcd_jax.verify.elite import Elite
 from rtcd_jax.verify.simulate import ARRIVED, FORGOTTEN, settling_time
 
 BATCH = 2048
 """Lanes in the compiled program."""
+TELLING = 0.02
+"""Share of the work from which on the time that is left can be told; before it, most was compilation."""
 REPORTED = 5.0
 """Least time between two lines of progress [s]."""
 
@@ -74,8 +76,8 @@ class Progress:
 
     def __str__(self) -> str:
         share = self.generation / self.generations
-        left = self.elapsed * (1 - share) / share if share else math.nan
-        return f"{self.experiment:12} {share:4.0%}  elapsed {self.elapsed:.0f} s  left {left:.0f} s"
+        left = f"  left {self.elapsed * (1 - share) / share:.0f} s" if share >= TELLING else ""
+        return f"{self.experiment:12} {share:4.0%}  elapsed {self.elapsed:.0f} s{left}"
 
 
 @final

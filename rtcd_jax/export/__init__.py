@@ -19,7 +19,7 @@ from rtcd_jax.errors import UserError
 from rtcd_jax.export import robot, source, tables
 from rtcd_jax.export.bundle import Bundle, certificate_path, read_bundle
 from rtcd_jax.files import is_temporary, plain, replace, replace_json, writing
-from rtcd_jax.storage import require_elites
+from rtcd_jax.records import require_elites
 
 FORMAT = "rtcd_jax export"
 VERSION = 1

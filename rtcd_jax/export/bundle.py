@@ -16,8 +16,8 @@ from rtcd_jax.errors import UserError
 from rtcd_jax.plants import plant_class
 from rtcd_jax.plants.base import Plant
 from rtcd_jax.plants.mjx import CpuDynamics, model_of
+from rtcd_jax.records import read_elite
 from rtcd_jax.report.tube import Tube
-from rtcd_jax.storage import read_elite
 from rtcd_jax.verify.elite import Elite
 from rtcd_jax.verify.simulate import fastest_rate
 

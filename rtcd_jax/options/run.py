@@ -16,7 +16,9 @@ from rtcd_jax.options.search import OPTIMIZE_USAGE
 class VerifyOptions:
     """Simulate fresh random states of a run's funnels with independent integrators; exit code 1 if too many fail.
 
-    The same command goes on after a stop. Example: rtcd verify checkpoints/pendulum_rtcd --states 100000
+    The same command goes on after a stop.
+
+    Example: rtcd verify checkpoints/pendulum_rtcd --states 100000
     """
 
     run: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RUN", help="the run folder")]
@@ -42,7 +44,9 @@ class ReportOptions:
 class AnimateOptions:
     """Show the swing-up by MuJoCo's renderer as MP4 and GIF: initial beside best, undisturbed and disturbed.
 
-    Needs no display: it draws by EGL or OSMesa. Example: rtcd animate checkpoints/pendulum_rtcd --to videos
+    Needs no display: it draws by EGL or OSMesa.
+
+    Example: rtcd animate checkpoints/pendulum_rtcd --to videos
     """
 
     run: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RUN", help="the run folder")]
@@ -56,6 +60,7 @@ class ReplayOptions:
 
     FILE has the columns time,pos,vel,torque or time,pos1,pos2,vel1,vel2,tau1,tau2 in SI units, the time from the start
     of the swing-up. Errors of angles are not wrapped: unwrap the encoder first.
+
     Example: rtcd replay checkpoints/pendulum_rtcd measured.csv --elite 0
     """
 

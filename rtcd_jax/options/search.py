@@ -8,11 +8,12 @@ from typing import Annotated
 import tyro
 from tyro.constructors import ConstructorRegistry
 
-from rtcd_jax.config import EXAMPLE, SMALLEST_POPULATION, Config, load, parse, parse_yaml
+from rtcd_jax.config import EXAMPLE, Config, load, parse, parse_yaml
 from rtcd_jax.errors import UserError
 from rtcd_jax.options.checks import require_at_least
 from rtcd_jax.options.machines import Machines
 from rtcd_jax.options.tree import Branch, config_branch, plain
+from rtcd_jax.sections import SMALLEST_POPULATION
 from rtcd_jax.sweep import Case, read_cases
 
 OPTIMIZE_USAGE = "rtcd optimize CONFIG [--run FOLDER] [--KEY VALUE …]"

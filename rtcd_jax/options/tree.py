@@ -7,7 +7,8 @@ from typing import Any, cast
 from pydantic.fields import FieldInfo
 from tyro.constructors import StructConstructorSpec, StructFieldSpec, StructTypeInfo
 
-from rtcd_jax.config import UNIT, Config, Variable
+from rtcd_jax.config import Config
+from rtcd_jax.sections import UNIT, Variable
 from rtcd_jax.settings import Settings, bounds
 
 POLICY_UNITS = {"authority": "-", "discount": "1/s"}

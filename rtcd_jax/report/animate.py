@@ -17,11 +17,11 @@ from jaxtyping import Float
 
 from rtcd_jax.config import Config
 from rtcd_jax.errors import UserError
-from rtcd_jax.files import writing
+from rtcd_jax.files import make_folder, writing
+from rtcd_jax.records import read_config, read_elite, require_elites
 from rtcd_jax.report.motion import Motions, dynamics_before_mujoco, frame_times, motions
 from rtcd_jax.report.render import Camera, choose_backend
 from rtcd_jax.report.tube import Tube
-from rtcd_jax.storage import read_config, read_elite, require_elites
 
 if TYPE_CHECKING:
     from PIL.Image import Image
@@ -83,8 +83,7 @@ def animate_run(folder: Path, to: Path | None, seed: int, console: Console) -> l
     config = read_config(folder)
     require_elites(folder)
     target = to or folder / "animation"
-    with writing(target):
-        target.mkdir(parents=True, exist_ok=True)
+    make_folder(target)
     backend = choose_backend()
     columns = _columns(folder, config, seed, console)
     console.message(f"rendering {len(columns[0].motions.time)} frames by MuJoCo ({backend})")
@@ -99,7 +98,7 @@ def animate_run(folder: Path, to: Path | None, seed: int, console: Console) -> l
                 add(frame)
         _write_gif(small, written[0])
     if not program:
-        console.message("no MP4: there is no ffmpeg; install it, or `pip install 'rtcd-jax[video]'`")
+        console.message("no MP4: there is no ffmpeg; install it, or `pip install -e '.[video]'`")
     for path in written:
         console.message(f"{path}, {path.stat().st_size / 1e6:.1f} MB")
     return written

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from rtcd_jax.files import replace, writing
+from rtcd_jax.files import make_folder, replace
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -57,8 +57,7 @@ def blank(size: tuple[float, float]) -> Iterator["Figure"]:
 
 def written(figure: "Figure", folder: Path, name: str) -> list[Path]:
     """Writes NAME.png and NAME.pdf; UserError if the folder cannot be written."""
-    with writing(folder):
-        folder.mkdir(parents=True, exist_ok=True)
+    make_folder(folder)
     paths = []
     for suffix, undated in (("png", {"Software": None}), ("pdf", {"CreationDate": None})):
         content = io.BytesIO()

@@ -8,8 +8,9 @@ from typing import Any, final
 import numpy as np
 from jaxtyping import Float
 
-from rtcd_jax.config import Config, Variable
+from rtcd_jax.config import Config
 from rtcd_jax.report.words import letter, words
+from rtcd_jax.sections import Variable
 
 Generations = Sequence[Mapping[str, Any]]
 QUANTILES = (10, 90)

@@ -12,8 +12,8 @@ from jaxtyping import Float
 from rtcd_jax.config import Config
 from rtcd_jax.errors import UserError
 from rtcd_jax.files import read_json
+from rtcd_jax.records import elite_names, read_config, read_elite, read_generations, require_elites
 from rtcd_jax.report.words import VOLUMES
-from rtcd_jax.storage import elite_names, read_config, read_elite, read_generations, require_elites
 
 # Okabe and Ito's colors: told apart by all kinds of color vision.
 BLUE, VERMILION = "#0072B2", "#D55E00"

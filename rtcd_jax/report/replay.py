@@ -12,14 +12,14 @@ from jaxtyping import Bool, Float
 
 from rtcd_jax.config import Config
 from rtcd_jax.errors import UserError
-from rtcd_jax.files import replace, replace_json, writing
+from rtcd_jax.files import make_folder, replace, replace_json
+from rtcd_jax.records import read_config, read_elite, require_elites
 from rtcd_jax.report.canvas import BLACK, GRAY, LIGHT, WIDTH, blank, written
 from rtcd_jax.report.funnels import draw_shadows, frame, told_once, window
 from rtcd_jax.report.measured import Measured, jumps, read_measured
 from rtcd_jax.report.reading import BLUE, VERMILION, Shown
 from rtcd_jax.report.shapes import planes
 from rtcd_jax.report.tube import Tube
-from rtcd_jax.storage import read_config, read_elite, require_elites
 
 LEAST = 1e-4
 """V/rho that the figure still tells from zero."""
@@ -71,7 +71,7 @@ class Replay:
 def replay_run(folder: Path, file: Path, elite: int | str, console: Console) -> bool:
     """Replays a measured file against the funnel of an elite, or of the candidate "initial"; True if it stayed inside.
 
-    Writes `replay/NAME.csv`, `.json`, `.png` and `.pdf`, NAME that of the measured file.
+    Writes `replay/NAME_ELITE.csv`, `.json`, `.png` and `.pdf`, NAME that of the measured file.
 
     Raises:
         UserError: no run folder, no such elite, a file that is no measured motion, or a folder that cannot be written.
@@ -84,15 +84,14 @@ def replay_run(folder: Path, file: Path, elite: int | str, console: Console) -> 
     measured = read_measured(file, arrays["x"].shape[1])
     _check_time(file, measured, float(tube.elite.time[-1]))
     replay = Replay(measured, tube.fill(measured.time, measured.x), name, record)
-    results = folder / "replay"
-    with writing(results):
-        results.mkdir(exist_ok=True)
-    replace(results / f"{file.stem}.csv", _table(replay).encode())
-    replace_json(results / f"{file.stem}.json", {"file": str(file), **replay.told()})
-    _draw(config, Shown.of(f"funnel of {name}", VERMILION, arrays, record), replay, results, file.stem)
+    results, stem = folder / "replay", f"{file.stem}_{name}"
+    make_folder(results)
+    replace(results / f"{stem}.csv", _table(replay).encode())
+    replace_json(results / f"{stem}.json", {"file": str(file), **replay.told()})
+    _draw(config, Shown.of(f"funnel of {name}", VERMILION, arrays, record), replay, results, stem)
     for line in [*jumps(measured, list(config.plant.states.values())), *_summary(replay)]:
         console.message(line)
-    console.message(f"V/rho of every sample, and its figure: {results / file.stem}.csv, .json, .png, .pdf")
+    console.message(f"V/rho of every sample, and its figure: {results / stem}.csv, .json, .png, .pdf")
     return replay.kept
 
 

@@ -20,7 +20,7 @@ from rich.table import Table
 
 from rtcd_jax.config import Config, config_hash
 from rtcd_jax.console import Console
-from rtcd_jax.files import plain, replace, writing
+from rtcd_jax.files import make_folder, plain, replace, writing
 from rtcd_jax.scale.figures import draw
 
 POINTS, TABLE = "points.jsonl", "table.csv"
@@ -55,13 +55,13 @@ def study(
     that fails says why in its row, and the others go on.
     """
     mark = {"config_hash": config_hash(config), "machine": platform.node(), "repeats": repeats}
-    with writing(folder):
-        folder.mkdir(parents=True, exist_ok=True)
+    make_folder(folder)
     found = {_place(point): point for point in _kept(folder / POINTS, mark)}
     grid = [(population, count) for population in sorted(set(populations)) for count in sorted(set(devices))]
     began = time.monotonic()
     for index, (population, count) in enumerate(grid):
         if (population, count) not in found:
+            console.message(f"population {population}, {count} devices: a process of its own, which compiles first")
             point = mark | {"load": os.getloadavg()[0]} | _measured(path, population, count, repeats)
             with writing(folder / POINTS), (folder / POINTS).open("a") as file:
                 file.write(json.dumps(plain(point)) + "\n")

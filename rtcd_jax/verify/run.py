@@ -18,8 +18,8 @@ from rich.table import Table
 
 from rtcd_jax.console import Console
 from rtcd_jax.errors import UserError
-from rtcd_jax.files import reading, replace, replace_json, writing
-from rtcd_jax.storage import read_elite, require_elites
+from rtcd_jax.files import make_folder, reading, replace, replace_json, writing
+from rtcd_jax.records import read_elite, require_elites
 from rtcd_jax.verify.elite import Elite
 from rtcd_jax.verify.simulate import Outcome
 from rtcd_jax.verify.verification import Trial, Verification
@@ -72,8 +72,7 @@ def verify_run(folder: Path, states: int, seed: int, workers: int, console: Cons
     """
     require_elites(folder)
     parts = folder / "verification" / ".parts"
-    with writing(parts):
-        parts.mkdir(parents=True, exist_ok=True)
+    make_folder(parts)
     trials = {}
     for funnel in PLACES:
         status = _read(folder, funnel)[1].get("status")
@@ -99,6 +98,7 @@ def verify_run(folder: Path, states: int, seed: int, workers: int, console: Cons
         parts.rmdir()
     if verifications:
         console.message(_table(verifications))
+        console.message(f"stored: {', '.join(f'{folder}/verification/{name}.json' for name in verifications)}")
     return all(verification.kept for verification in verifications.values())
 
 

@@ -3,7 +3,7 @@
 import dataclasses
 
 from rtcd_jax.disturb.contest import contest_of
-from rtcd_jax.storage import read_elite
+from rtcd_jax.records import read_elite
 from rtcd_jax.verify.elite import Elite
 from tests.export.folders import run_folder
 

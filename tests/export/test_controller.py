@@ -108,6 +108,15 @@ def test_the_monitor_says_inside_and_abort_on_both_sides_of_the_boundary(export,
         np.testing.assert_allclose(watch.margin, 1 - radius**2, atol=1e-9)
 
 
+def test_a_state_is_flat_or_positions_and_velocities(export):
+    """As the folder's README calls it, for one joint or several."""
+    controller, x = export.module.Controller(), export.bundle.elite.x[1] + 0.01
+    pos, vel = x.reshape(2, -1)
+    measured = (pos[0], vel[0]) if pos.size == 1 else (pos, vel)
+    assert controller.monitor(0.01, [*measured]) == controller.monitor(0.01, x)
+    np.testing.assert_array_equal(controller.control(0.01, [*measured]), controller.control(0.01, x))
+
+
 def test_beyond_a_limit_of_the_states_the_monitor_advises_to_abort(export, loop):
     elite, monitor = export.bundle.elite, loop[1]
     limited = int(np.argmax(np.isfinite(elite.state_limits)))

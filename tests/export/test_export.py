@@ -11,7 +11,7 @@ import yaml
 from rtcd_jax.errors import UserError
 from rtcd_jax.export import export_run
 from rtcd_jax.export.bundle import read_bundle
-from rtcd_jax.storage import read_elite
+from rtcd_jax.records import read_elite
 from tests.certificate import swing
 from tests.export.conftest import Silent
 from tests.export.folders import run_folder

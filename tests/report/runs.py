@@ -7,7 +7,7 @@ import yaml
 
 from rtcd_jax import config as configuration
 from rtcd_jax.files import plain, replace_json
-from rtcd_jax.storage import FORMAT, VERSION, write_elite
+from rtcd_jax.records import FORMAT, VERSION, write_elite
 
 KNOTS = 7
 CARTPOLE = """\

@@ -6,8 +6,9 @@ import re
 import pytest
 
 from rtcd_jax.errors import UserError
-from rtcd_jax.report import report
+from rtcd_jax.report import refresh, report
 from rtcd_jax.report.page import render
+from rtcd_jax.report.plots import plots
 from rtcd_jax.report.reading import compared, read_run
 from tests.report import browser
 from tests.report.runs import candidate, experiment, finished, prove_and_verify, run_folder
@@ -138,6 +139,29 @@ def test_pictures_of_an_experiment_are_in_the_page(tmp_path, pages):
     (run / "disturbance" / "off_nominal_map.png").write_bytes(b"picture")
     assert '<img src="data:image/png;base64,cGljdHVyZQ=="' in render([read_run(run)])
     assert "<img" not in pages["pendulum"].read_text()
+
+
+def test_a_page_that_is_there_is_brought_up_to_date_and_none_is_made(tmp_path):
+    run = finished(tmp_path / "run")
+    assert refresh(run) is None
+    assert not (run / "report.html").exists()
+    (run / "report.html").write_text(render([read_run(run)]))
+    prove_and_verify(run)
+    assert refresh(run) == run / "report.html"
+    assert (run / "report.html").read_text() == render([read_run(run)])
+    assert "promises kept" in (run / "report.html").read_text()
+    assert not (run / "figures").exists()
+
+
+def test_compared_searches_show_best_median_and_feasible_share_over_their_candidates(tmp_path):
+    runs = compared([read_run(finished(tmp_path / name, scale=scale)) for name, scale in (("rtc", 2.0), ("rtcd", 5.0))])
+    data = plots(runs)["convergence"]["data"]
+    assert [(line["name"], line["yaxis"]) for line in data[:3]] == [
+        ("rtc (sum)", "y"), ("rtc, median", "y"), ("rtc, feasible", "y2"),
+    ]  # fmt: skip
+    assert [line["y"] for line in data[3:]] == [[100.0, 101.0, 102.0], [60.0] * 3, [0.75] * 3]
+    assert all(line["x"] == [4, 8, 12] for line in data)
+    assert {line["line"]["color"] for line in data[3:]} == {runs[1].best.color}
 
 
 def test_one_run_gets_its_page_and_figures_several_get_one_beside_them(tmp_path, figures):

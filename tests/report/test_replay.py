@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from rtcd_jax.errors import UserError
+from rtcd_jax.records import write_elite
 from rtcd_jax.report.measured import columns_of, jumps, read_measured
 from rtcd_jax.report.replay import replay_run
 from rtcd_jax.report.tube import Tube
-from rtcd_jax.storage import write_elite
 from tests.report.loops import LOOPS, loop_folder, stored
 
 HEADS = {"pendulum": "time,pos,vel,torque", "cartpole": "time,pos1,pos2,vel1,vel2,tau1,tau2"}
@@ -51,13 +51,13 @@ def test_a_motion_inside_all_the_way_is_told_its_smallest_margin(tmp_path, plant
     time, x = motion(plant, lambda t: 0.5 + 0.4 * np.exp(-(((t - 0.02) / 0.01) ** 2)))
     said = Said()
     assert replay_run(folder, measured_file(tmp_path / "lab.csv", plant, time, x), 0, said)
-    told = json.loads((folder / "replay" / "lab.json").read_text())
+    told = json.loads((folder / "replay" / "lab_000.json").read_text())
     fill = (0.5 + 0.4 * np.exp(-(((time - 0.02) / 0.01) ** 2))) ** 2
     assert told["inside"]
     assert told["first_exit"] is None
     assert told["smallest_margin"] == pytest.approx(1 - fill.max())
     assert told["closest"]["time"] == time[fill.argmax()]
-    with (folder / "replay" / "lab.csv").open() as file:
+    with (folder / "replay" / "lab_000.csv").open() as file:
         rows = list(csv.DictReader(file))
     np.testing.assert_allclose([float(row["V/rho"]) for row in rows], fill)
     assert {row["inside"] for row in rows} == {"1"}
@@ -71,7 +71,9 @@ def test_the_initial_candidate_s_funnel_is_its_own(tmp_path, figures):
     path = measured_file(tmp_path / "lab.csv", "pendulum", *motion("pendulum", lambda t: np.full_like(t, 0.7)))
     assert replay_run(folder, path, 0, Said())
     assert not replay_run(folder, path, "initial", Said())
-    assert json.loads((folder / "replay" / "lab.json").read_text())["first_exit"]["V/rho"] == pytest.approx(4 * 0.49)
+    told = json.loads((folder / "replay" / "lab_initial.json").read_text())
+    assert told["first_exit"]["V/rho"] == pytest.approx(4 * 0.49)
+    assert json.loads((folder / "replay" / "lab_000.json").read_text())["inside"]
 
 
 @pytest.mark.parametrize(("peak", "kept"), [(0.999, True), (1.001, False)])
@@ -86,7 +88,7 @@ def test_the_first_exit_is_told_with_time_fill_and_state(tmp_path, plant, figure
     time, x = motion(plant, lambda t: np.where(t < 0.03, 0.5, np.where(t < 0.035, 3.0, 1.5)))
     said = Said()
     assert not replay_run(folder, measured_file(tmp_path / "lab.csv", plant, time, x), 0, said)
-    told = json.loads((folder / "replay" / "lab.json").read_text())
+    told = json.loads((folder / "replay" / "lab_000.json").read_text())
     first = int(np.argmax(time >= 0.03))
     assert told["first_exit"]["time"] == time[first]
     assert told["first_exit"]["V/rho"] == pytest.approx(9.0)

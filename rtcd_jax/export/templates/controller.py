@@ -2,7 +2,7 @@
 
     controller = Controller()
     des_pos, des_vel, des_tau = controller.get_control_output(meas_pos, meas_vel, meas_tau, meas_time)
-    watch = controller.monitor(meas_time, [*meas_pos, *meas_vel])
+    watch = controller.monitor(meas_time, [meas_pos, meas_vel])
 
 Time counts from the start of the motion. Angles are not wrapped. `controller.json` has units, signs and limits.
 `python controller.py` compares the controller with `test_vectors.csv`.
@@ -89,12 +89,12 @@ class Controller:
         return nominal[:half], nominal[half:], tau
 
     def control(self, t: float, x) -> np.ndarray:
-        """u [inputs] of the state x = (positions, velocities); zero if x or t is not finite."""
-        return self._nominal_and_input(t, np.asarray(x, float))[1]
+        """u [inputs] of the state x as in `monitor`; zero if x or t is not finite."""
+        return self._nominal_and_input(t, np.asarray(x, float).reshape(-1))[1]
 
     def monitor(self, t: float, x) -> Monitor:
-        """Whether x = (positions, velocities) is inside the funnel at time t."""
-        x = np.asarray(x, float)
+        """Whether x = (positions, velocities), flat or [positions, velocities], is inside the funnel at time t."""
+        x = np.asarray(x, float).reshape(-1)
         if not (np.isfinite(x).all() and np.isfinite(t)):
             return Monitor(np.inf, -np.inf, False, True)
         k, s = self._place(t)
