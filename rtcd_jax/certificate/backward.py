@@ -45,8 +45,8 @@ FASTEST = 100.0
 SETTLING = 0.02
 """Time [s] in which an ellipsoid may use up what is left to a limit on the states."""
 SHARE_OF_LIMIT = 0.99
-WIDEST = 2.0
-"""Largest half width [rad] along the angle: beyond it polynomials follow the sine badly."""
+WIDEST = 0.5
+"""Half width [rad] along the angle up to which ellipsoids grow: polynomials of order 5 follow no wider sine well."""
 
 
 def grown(best: Loop, aims: np.ndarray) -> Loop:
@@ -140,7 +140,8 @@ def _products(y: np.ndarray, pairs: list[tuple[int, int]]) -> np.ndarray:
 def _limits(loop: Loop, k: int, share: float, axes: np.ndarray, pairs: list) -> tuple[np.ndarray, np.ndarray]:
     """Rows and least values: half widths |row of L| grow backward no faster than what is left to their limits."""
     rooms = SHARE_OF_LIMIT * loop.rooms(k, share)
-    rooms[loop.plant.angle] = min(rooms[loop.plant.angle], WIDEST)
+    widths, angle = np.linalg.norm(axes, axis=1), loop.plant.angle
+    rooms[angle] = min(rooms[angle], max(WIDEST, widths[angle]))
     bounded = np.isfinite(rooms)
-    widths = np.linalg.norm(axes, axis=1)[bounded]
+    widths = widths[bounded]
     return _products((axes[bounded] / widths[:, None]).T, pairs), -np.log(rooms[bounded] / widths) / SETTLING

@@ -3,14 +3,14 @@
 V = e'P e with P free at every knot, and its rate free at both ends of every interval: between them P is the cubic
 Hermite interpolant, as TVLQR's own is. The program is
 
-    maximize    integral of det P^-1/2
+    maximize    log (integral of det P^-1/2 over time) + INLET log (det P^-1/2 at t = 0)
     such that   V' <= -spare V  wherever V = 1, and for all V <= 1 at the goal,
                 {V <= 1} keeps the limits on the states.
 
 It is solved as a sequence of linear programs. V' is asked for at sampled instants and directions e of the present
 ellipsoids, and is linearized in P: where P changes by dP, the boundary point e moves to (1 + r) e with
 r = -e'dP e / 2. What the linearization misses is made good by levels: they are carried back from the goal as in a proof
-with a given V, so that every iterate is a funnel, its volume known. A step is taken if the volume grows. (Tobenkin,
+with a given V, so that every iterate is a funnel, its volume known. A step is taken if the objective grows. (Tobenkin,
 Manchester, Tedrake 2011 alternate between multipliers and V to the same end.)
 """
 

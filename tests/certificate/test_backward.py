@@ -9,6 +9,12 @@ from rtcd_jax.certificate.levels import SPARED, directions, leveled, merit
 from tests.certificate.test_joint import AIMS, loop_of
 
 
+@pytest.fixture(autouse=True)
+def wide(monkeypatch):
+    """Two states have polynomials of a higher order."""
+    monkeypatch.setattr(backward, "WIDEST", 2.0)
+
+
 @pytest.fixture(scope="module")
 def funnel():
     return leveled(loop_of(), AIMS)
