@@ -25,9 +25,15 @@ if [[ $code == 85 || $code == 75 ]]; then
   elif ! command -v scontrol >/dev/null; then
     echo "scontrol is not here (a container?): requeue by hand, scontrol requeue $SLURM_JOB_ID"
   else
-    # Job arrays are requeued task by task.
+    # Job arrays are requeued task by task. A job that is cancelled is at its end already.
     job=${SLURM_ARRAY_JOB_ID:+${SLURM_ARRAY_JOB_ID}_$SLURM_ARRAY_TASK_ID}
-    scontrol requeue "${job:-$SLURM_JOB_ID}"
+    job=${job:-$SLURM_JOB_ID}
+    state=$(scontrol show job --oneliner "$job" | sed -n 's/.* JobState=\([A-Z]*\).*/\1/p')
+    if [[ $state == RUNNING ]]; then
+      scontrol requeue "$job"
+    else
+      echo "job $job is $state: not requeued"
+    fi
   fi
 fi
 exit $code
