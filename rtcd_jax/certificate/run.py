@@ -17,9 +17,10 @@ from rich.table import Table
 from scipy.stats import spearmanr
 
 from rtcd_jax.certificate.elite import Outcome, Step, certify_elite
+from rtcd_jax.certificate.loop import claim_of
 from rtcd_jax.console import Console
 from rtcd_jax.files import make_folder, read_json, replace_json
-from rtcd_jax.records import require_elites
+from rtcd_jax.records import read_elite, require_elites
 from rtcd_jax.workers import CONTEXT, processes
 
 POLL = 0.2
@@ -55,9 +56,12 @@ def certify_run(
     Stores `certificates/NNN.json` and `certificates/summary.json`. What was finished before a kill is not done again.
 
     Raises:
-        UserError: no run folder, a run without elites, or a folder that cannot be written.
+        UserError: no run folder, a run without elites, an elite that cannot be read or is of a plant that the checker
+            does not know, or a folder that cannot be written.
     """
     names = require_elites(folder)[:elites]
+    for name in names:  # at once, and not from a worker
+        claim_of(*read_elite(folder / "elites", name))
     target = folder / "certificates"
     make_folder(target)
     summary = target / "summary.json"
