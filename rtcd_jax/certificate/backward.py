@@ -22,7 +22,16 @@ from scipy.linalg import expm
 from scipy.optimize import linprog
 
 from rtcd_jax.certificate.check import Refused
-from rtcd_jax.certificate.levels import SHARES, SPARED, directions, leveled, merit
+from rtcd_jax.certificate.levels import (
+    SHARE_OF_LIMIT,
+    SHARES,
+    SPARED,
+    directions,
+    leveled,
+    lower_pairs,
+    merit,
+    products,
+)
 from rtcd_jax.certificate.loop import Loop
 
 
@@ -44,7 +53,6 @@ FASTEST = 100.0
 """Largest |entry of W| [1/s]."""
 SETTLING = 0.02
 """Time [s] in which an ellipsoid may use up what is left to a limit on the states."""
-SHARE_OF_LIMIT = 0.99
 WIDEST = 0.5
 """Half width [rad] along the angle up to which ellipsoids grow: polynomials of order 5 follow no wider sine well."""
 
@@ -98,20 +106,20 @@ def held_level(s: np.ndarray, axes: np.ndarray) -> float:
 
 def fastest_growth(loop: Loop, k: int, axes: np.ndarray, aim: Aim, y: np.ndarray) -> np.ndarray | None:
     """W [n n] for the interval k, which ends with the ellipsoid `axes`; None if there is none."""
-    pairs = [(i, j) for i in range(loop.n) for j in range(i + 1)]
+    pairs = lower_pairs(loop.n)
     weight = _importance(axes.T @ loop.values[k + 1] @ axes, aim.attraction)
     cost = np.array([*(weight[i, j] * (1 if i == j else 2) for i, j in pairs), aim.evenness])
-    products = _products(y, pairs)
-    below = np.column_stack([-products, np.ones(len(products))])  # the last unknown is max y'W y
+    along = products(y, y)
+    below = np.column_stack([-along, np.ones(len(along))])  # the last unknown is max y'W y
     w = path = np.zeros((loop.n, loop.n))
     for _ in range(ROUNDS):
         path = (path + w) / 2  # without the average the rounds alternate about their limit
         rows, levels = [], []
         for share in SHARES:
             here = axes @ expm(-path * (1 - share) * loop.dt)
-            rows.append(products)
+            rows.append(along)
             levels.append(loop.drift(k, share, here, y) + SPARED)
-            narrow, least = _limits(loop, k, share, here, pairs)
+            narrow, least = _limits(loop, k, share, here)
             rows.append(narrow)
             levels.append(least)
         table = np.concatenate(rows)
@@ -132,16 +140,12 @@ def _importance(g: np.ndarray, attraction: float) -> np.ndarray:
     return (vectors * (len(g) * weights / weights.sum())) @ vectors.T
 
 
-def _products(y: np.ndarray, pairs: list[tuple[int, int]]) -> np.ndarray:
-    """Coefficients [D, pairs] of y'W y in the entries of W."""
-    return np.stack([y[i] * y[j] * (1 if i == j else 2) for i, j in pairs], axis=1)
-
-
-def _limits(loop: Loop, k: int, share: float, axes: np.ndarray, pairs: list) -> tuple[np.ndarray, np.ndarray]:
+def _limits(loop: Loop, k: int, share: float, axes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Rows and least values: half widths |row of L| grow backward no faster than what is left to their limits."""
     rooms = SHARE_OF_LIMIT * loop.rooms(k, share)
     widths, angle = np.linalg.norm(axes, axis=1), loop.plant.angle
     rooms[angle] = min(rooms[angle], max(WIDEST, widths[angle]))
     bounded = np.isfinite(rooms)
     widths = widths[bounded]
-    return _products((axes[bounded] / widths[:, None]).T, pairs), -np.log(rooms[bounded] / widths) / SETTLING
+    rows = (axes[bounded] / widths[:, None]).T
+    return products(rows, rows), -np.log(rooms[bounded] / widths) / SETTLING

@@ -21,7 +21,19 @@ import scipy.sparse as sp
 from scipy.optimize import linprog
 
 from rtcd_jax.certificate.check import Refused, insist
-from rtcd_jax.certificate.levels import INLET, SHARES, SPARED, directions, integral, leveled, merit, values_at
+from rtcd_jax.certificate.levels import (
+    INLET,
+    SHARE_OF_LIMIT,
+    SHARES,
+    SPARED,
+    directions,
+    integral,
+    leveled,
+    lower_pairs,
+    merit,
+    products,
+    values_at,
+)
 from rtcd_jax.certificate.loop import Loop, hermite
 
 LEVELS = np.linspace(0.1, 1, 10)
@@ -33,7 +45,6 @@ BENDING = 4.0
 ROUNDS = 40
 WIDEST = 3.0
 """Largest half width [rad] along the angle: beyond it polynomials follow the sine badly."""
-SHARE_OF_LIMIT = 0.99
 THINNED = 8
 """The linear programs get one of so many directions,"""
 KEPT = 40
@@ -106,7 +117,7 @@ class Program:
         basis = [hermite(SHARES, 1.0, *row) for row in np.eye(4)]
         self.weights = np.stack([weight for weight, _ in basis], axis=1)
         self.rates = np.stack([rate for _, rate in basis], axis=1) / loop.dt
-        self.pairs = [(i, j) for i in range(loop.n) for j in range(i + 1)]
+        self.pairs = lower_pairs(loop.n)
         self.reach = trust * np.repeat([1.0, BENDING], [(n + 1) * len(self.pairs), 2 * n * len(self.pairs)])
 
     def falling(self) -> Rows:
@@ -119,8 +130,8 @@ class Program:
         parts = []
         for knot in (self.units[:-1, None], self.units[1:, None]):
             p = knot @ e
-            moved = self._products(p, p)
-            parts.append((2 * self._products(p, knot @ motion) - stretch[..., None] / 2 * moved, moved))
+            moved = products(p, p)
+            parts.append((2 * products(p, knot @ motion) - stretch[..., None] / 2 * moved, moved))
         coefficients = [
             self.weights[:, None, None, j] * parts[j // 2][0] + self.rates[:, None, None, j] * parts[j // 2][1]
             for j in range(4)
@@ -134,7 +145,7 @@ class Program:
         v, e, motion, stretch = _decrease(
             value, np.zeros_like(value), level * np.linalg.solve(unit, y), self._goal_rates
         )
-        coefficients = 2 * self._products(unit @ e, unit @ motion) - stretch[..., None] / 2 * self._products(y, y)
+        coefficients = 2 * products(unit @ e, unit @ motion) - stretch[..., None] / 2 * products(y, y)
         room = -SPARED * level[..., 0] ** 2 - v
         return self._rows(coefficients[..., None, :], np.array([len(self.loop.u)]), room)
 
@@ -147,7 +158,7 @@ class Program:
         spread = np.linalg.inv(self.value)
         widths = np.diagonal(spread, axis1=-2, axis2=-1)[..., bounded]
         p = [knot @ spread[..., bounded] for knot in (self.units[:-1, None], self.units[1:, None])]
-        moved = [self._products(each, each) for each in p]
+        moved = [products(each, each) for each in p]
         coefficients = [-self.weights[:, None, None, j] * moved[j // 2] for j in range(4)]
         room = rooms[..., bounded] ** 2 - widths
         return self._rows(np.stack(coefficients, axis=-2), self.blocks[:, None, None], room)
@@ -160,7 +171,7 @@ class Program:
         total = np.zeros((len(self.reach) // len(self.pairs), len(self.pairs)))
         for j in range(4):
             p = self.units[j // 2 : len(self.blocks) + j // 2, None] @ self.axes
-            shrinks = self._products(p, p).sum(axis=-2)
+            shrinks = products(p, p).sum(axis=-2)
             np.add.at(total, self.blocks[:, j], np.sum((self.weights[:, j] * density)[..., None] * shrinks, axis=1))
         total /= integral(self.loop)
         total[0, [i == j for i, j in self.pairs]] -= INLET / 2
@@ -195,12 +206,6 @@ class Program:
         loop = self.loop
         u = np.clip(-loop.goal_gain @ error, -loop.limit, loop.limit)
         return np.moveaxis(loop.rate(np.moveaxis(loop.goal[:, None] + error, -2, 0), u), 0, -2)
-
-    def _products(self, p: np.ndarray, q: np.ndarray) -> np.ndarray:
-        """Coefficients [... D m] of p'X q in the entries of X; p, q [... n D]."""
-        return np.stack(
-            [p[..., i, :] * q[..., j, :] + (i != j) * p[..., j, :] * q[..., i, :] for i, j in self.pairs], axis=-1
-        )
 
     def _rows(self, coefficients: np.ndarray, blocks: np.ndarray, room: np.ndarray) -> Rows:
         """Those inequalities, coefficients [... B m] of the unknowns `blocks` [... B], that the program can break."""

@@ -14,6 +14,8 @@ COLLAPSE = 1e-3
 """Share of its level that a funnel must keep within an interval."""
 BOX_SHARE = 0.999
 """Share of the level at which an ellipsoid would touch a limit."""
+SHARE_OF_LIMIT = 0.99
+"""Share of what is left to a limit that ellipsoids of free shape may fill."""
 DIRECTIONS = {2: 720, 4: 4000}
 SPARED = 0.02
 """Spare rate [1/s] of funnels that are not proved yet."""
@@ -38,6 +40,19 @@ def directions(n: int) -> np.ndarray:
         return np.stack([np.cos(angle), np.sin(angle)])
     found = np.random.default_rng(0).normal(size=(n, DIRECTIONS[n]))
     return found / np.linalg.norm(found, axis=0)
+
+
+def lower_pairs(n: int) -> list[tuple[int, int]]:
+    """The entries (i, j) of a symmetric matrix's lower half, in the order in which programs have them."""
+    return [(i, j) for i in range(n) for j in range(i + 1)]
+
+
+def products(p: np.ndarray, q: np.ndarray) -> np.ndarray:
+    """Coefficients [... D m] of p'X q in the `lower_pairs` of a symmetric X; p, q [... n D]."""
+    return np.stack(
+        [p[..., i, :] * q[..., j, :] + (i != j) * p[..., j, :] * q[..., i, :] for i, j in lower_pairs(p.shape[-2])],
+        axis=-1,
+    )
 
 
 def goal_level(loop: Loop, aims: np.ndarray) -> float:
