@@ -3,7 +3,7 @@
 The data flow, one module a step; every step is written for one candidate and mapped over the population once:
 
     genome -> Candidate -> Trajectory -> Policy -> Funnel -> Volumes
-              population   trajectory    policy    funnel    volume
+              genome       trajectory    policy    funnel    volume
 
 `evaluation` chains the steps, `search` asks CMA-ES for genomes and keeps the elites, `rtcd` is the command line.
 The names below are imported at their first use, so that `import rtcd_jax` alone stays light.
@@ -13,11 +13,11 @@ from importlib import import_module
 from typing import Any
 
 _HOMES = {
-    "Config": "config",
-    "load": "config",
-    "parse_yaml": "config",
-    "ConfigError": "errors",
-    "UserError": "errors",
+    "Config": "config.load",
+    "load": "config.load",
+    "parse_yaml": "config.load",
+    "ConfigError": "system.errors",
+    "UserError": "system.errors",
     "Candidate": "types",
     "Trajectory": "types",
     "Policy": "types",
@@ -27,8 +27,8 @@ _HOMES = {
     "Status": "types",
     "Problem": "problem",
     "make_problem": "problem",
-    "decode": "population",
-    "initial_genome": "population",
+    "decode": "genome",
+    "initial_genome": "genome",
     "plan": "trajectory",
     "stabilize": "policy",
     "estimate_funnel": "funnel",

@@ -10,13 +10,13 @@ from functools import partial
 import jax
 
 from rtcd_jax import rollout
-from rtcd_jax.confirmation import Dynamics, Effort
 from rtcd_jax.funnel import estimate_funnel
+from rtcd_jax.genome import decode
 from rtcd_jax.policy import stabilize
-from rtcd_jax.population import decode
 from rtcd_jax.problem import Problem
 from rtcd_jax.trajectory import plan
 from rtcd_jax.types import Candidate, Evaluation, Policy, Trajectory
+from rtcd_jax.validation import Dynamics, Effort
 from rtcd_jax.volume import funnel_volume
 
 Evaluate = Callable[[jax.Array, jax.Array], Evaluation]

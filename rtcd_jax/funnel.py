@@ -16,13 +16,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from rtcd_jax import rollout
-from rtcd_jax.confirmation import Effort, confirm, follow
 from rtcd_jax.numerics import sampling
 from rtcd_jax.numerics.batched import solve_lower
 from rtcd_jax.numerics.ellipsoid import Ellipsoids
 from rtcd_jax.numerics.sphere import climb
 from rtcd_jax.problem import Problem
 from rtcd_jax.types import Candidate, Funnel, Policy, Status, first_failure
+from rtcd_jax.validation import Effort, confirm, follow
 
 SMALLEST = 1e-3
 """Radius below which a set counts as empty, over the box's or that at which the goal's LQR saturates."""

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from rtcd_jax.config import Config
+from rtcd_jax.config.load import Config
 from rtcd_jax.plants import plant_class
 from rtcd_jax.plants.base import Plant
 

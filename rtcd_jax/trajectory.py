@@ -14,10 +14,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from rtcd_jax.genome import decode, initial_genome
 from rtcd_jax.numerics import interior_point
 from rtcd_jax.numerics.derivatives import jacobian
 from rtcd_jax.numerics.integrate import componentwise, rk4, split
-from rtcd_jax.population import decode, initial_genome
 from rtcd_jax.problem import Problem
 from rtcd_jax.types import Candidate, Status, Trajectory
 

@@ -13,7 +13,7 @@ import numpy as np
 import scipy.linalg
 import yaml
 
-from rtcd_jax import config as configuration
+from rtcd_jax.config import load as configuration
 from rtcd_jax.numerics.ellipsoid import Ellipsoids
 from rtcd_jax.plants.base import Plant
 from rtcd_jax.problem import Problem

@@ -7,9 +7,9 @@ import jax.numpy as jnp
 import numpy as np
 import yaml
 
-from rtcd_jax import config as configuration
+from rtcd_jax.config import load as configuration
 from rtcd_jax.evaluation import make_evaluate
-from rtcd_jax.population import _to_unit
+from rtcd_jax.genome import _to_unit
 from rtcd_jax.problem import Problem, make_problem
 from rtcd_jax.types import Evaluation
 

@@ -2,7 +2,6 @@
 
 import dataclasses
 from functools import partial
-from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -11,14 +10,13 @@ import pytest
 
 from rtcd_jax.evaluation import make_evaluate, resample, search_effort
 from rtcd_jax.funnel import MARGIN
+from rtcd_jax.genome import decode
 from rtcd_jax.numerics.ellipsoid import Ellipsoids
-from rtcd_jax.population import decode
 from rtcd_jax.types import Status
 from rtcd_jax.volume import funnel_volume
 from tests import pipeline
 from tests.pipeline import same
 
-ROOT = Path(__file__).parents[1]
 CLOSE = 1e-7
 """Programs of other sizes sum in another order, which the trajectory's stopping and the rollouts carry on."""
 

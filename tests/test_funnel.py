@@ -2,7 +2,6 @@
 
 import dataclasses
 from functools import cache, partial
-from pathlib import Path
 
 import equinox as eqx
 import jax
@@ -11,17 +10,18 @@ import numpy as np
 import pytest
 import yaml
 
-from rtcd_jax import config as configuration
 from rtcd_jax import rollout
-from rtcd_jax.confirmation import Dynamics, Effort
+from rtcd_jax.config import load as configuration
 from rtcd_jax.evaluation import elite_effort, make_evaluate, search_effort
 from rtcd_jax.funnel import MARGIN, _crossings, _scan_knots, estimate_funnel
 from rtcd_jax.numerics.ellipsoid import half_widths
 from rtcd_jax.problem import make_problem
 from rtcd_jax.types import Status
+from rtcd_jax.validation import Dynamics, Effort
 from rtcd_jax.volume import funnel_volume
 from tests import linear_system as linear
 from tests import pipeline
+from tests.paths import CONFIGS
 
 RADII = np.array([0.1, 0.2, 0.4, 0.8])
 MOVING = (0, 5, 6)
@@ -358,7 +358,7 @@ def _assert_inside(problem, policy, levels):
 @cache
 def _cartpoles():
     """Four random ones of the configuration's box, evaluated in closed form."""
-    path = Path(__file__).parent.parent / "configs" / "cartpole_rtcd.yaml"
+    path = CONFIGS / "cartpole_rtcd.yaml"
     data = yaml.safe_load(path.read_text())
     data["funnel"]["rollouts"] = "closed_form"
     problem = make_problem(configuration.parse(data))

@@ -2,7 +2,6 @@
 
 import dataclasses
 from functools import partial
-from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -12,14 +11,15 @@ import scipy.linalg
 from scipy.integrate import solve_ivp
 from scipy.interpolate import CubicHermiteSpline
 
-from rtcd_jax.config import load
+from rtcd_jax.config.load import load
 from rtcd_jax.plants.pendulum import PendulumDesign
 from rtcd_jax.policy import goal_value, linearize, nominal, options, stabilize
 from rtcd_jax.problem import make_problem
 from rtcd_jax.trajectory import plan
 from rtcd_jax.types import Candidate, Status
+from tests.paths import CONFIGS
 
-CONFIG = Path(__file__).parent.parent / "configs" / "pendulum_rtcd.yaml"
+CONFIG = CONFIGS / "pendulum_rtcd.yaml"
 
 # The paper's initial candidate, the stiffest corner of the box, its softest, and two between.
 MASS, LENGTH = np.array([0.7, 0.6, 0.8, 0.65, 0.75]), np.array([0.4, 0.4, 0.6, 0.5, 0.45])

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from rtcd_jax.config import EXAMPLE, parse_yaml
+from rtcd_jax.config.load import EXAMPLE, parse_yaml
 from rtcd_jax.plants.pendulum import Pendulum
 from rtcd_jax.problem import make_problem
 

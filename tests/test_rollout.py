@@ -11,8 +11,8 @@ import pytest
 from scipy.integrate import solve_ivp
 from scipy.interpolate import CubicHermiteSpline
 
-from rtcd_jax import config as configuration
 from rtcd_jax import rollout
+from rtcd_jax.config import load as configuration
 from rtcd_jax.problem import make_problem
 from rtcd_jax.types import Candidate, Policy, Trajectory
 

@@ -1,17 +1,14 @@
 """The starting guesses of the trajectory optimizer, for every robot that ships a configuration."""
 
-from pathlib import Path
-
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from rtcd_jax.config import load
+from rtcd_jax.config.load import load
 from rtcd_jax.problem import Problem, make_problem
 from rtcd_jax.trajectory import slowest_oscillation, starts
-
-CONFIGS = Path(__file__).parent.parent / "configs"
+from tests.paths import CONFIGS
 
 
 def _problem(name: str) -> Problem:

@@ -1,7 +1,6 @@
 """Trajectories of random candidates: solutions of the dynamics, inside the boxes, each as if it were alone."""
 
 from functools import partial
-from pathlib import Path
 
 import equinox as eqx
 import jax
@@ -11,14 +10,15 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from rtcd_jax import trajectory
-from rtcd_jax.config import load
+from rtcd_jax.config.load import load
+from rtcd_jax.genome import decode
 from rtcd_jax.numerics.integrate import rk4
-from rtcd_jax.population import decode
 from rtcd_jax.problem import make_problem
 from rtcd_jax.trajectory import plan
 from rtcd_jax.types import Status
+from tests.paths import CONFIGS
 
-CONFIG = Path(__file__).parent.parent / "configs" / "pendulum_rtcd.yaml"
+CONFIG = CONFIGS / "pendulum_rtcd.yaml"
 POPULATION = 256
 
 

@@ -37,7 +37,7 @@ from pydrake.systems.controllers import (
 from pydrake.systems.primitives import SymbolicVectorSystem
 from pydrake.trajectories import PiecewisePolynomial
 
-from rtcd_jax.config import Config
+from rtcd_jax.config.load import Config
 
 COSTS = ("integral", "knot_sum")
 STEP_GUESS = 0.06  # [s]

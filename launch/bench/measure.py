@@ -9,8 +9,8 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-from rtcd_jax.backend import prepare_jax
-from rtcd_jax.scale.clock import Timed, peak_memory, timed
+from rtcd_jax.analysis.scale.clock import Timed, peak_memory, timed
+from rtcd_jax.system.devices import prepare_jax
 
 RESULTS = Path(__file__).parent / "results"
 CONFIG = Path(__file__).parents[2] / "configs" / "pendulum_rtcd.yaml"
@@ -63,7 +63,7 @@ def measure_pipeline(config: Path, population: int, repeats: int) -> Measured:
     prepare_jax(1)
     import jax
 
-    from rtcd_jax.config import load
+    from rtcd_jax.config.load import load
     from rtcd_jax.evaluation import make_evaluate
     from rtcd_jax.problem import make_problem
     from rtcd_jax.types import Status

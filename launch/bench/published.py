@@ -14,7 +14,7 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 
-from rtcd_jax.backend import prepare_jax
+from rtcd_jax.system.devices import prepare_jax
 
 CONFIGS = Path(__file__).parents[2] / "configs"
 CANDIDATES = {  # the design variables, then the diagonals of Q and R (paper, table I and the authors' results)
@@ -42,11 +42,11 @@ def main() -> None:
     parser.add_argument("robot", nargs="?", choices=CANDIDATES, default="pendulum")
     robot = parser.parse_args().robot
     prepare_jax(1)
-    from rtcd_jax import search
-    from rtcd_jax.config import load
+    from rtcd_jax.config.load import load
     from rtcd_jax.evaluation import elite_effort, make_evaluate
-    from rtcd_jax.population import encode, initial_genome
+    from rtcd_jax.genome import encode, initial_genome
     from rtcd_jax.problem import make_problem
+    from rtcd_jax.search import search
 
     config = off_the_rail(load(_config("cartpole"))) if robot == "off_the_rail" else load(_config(robot))
     problem = make_problem(config)

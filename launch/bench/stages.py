@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from measure import CONFIG, RESULTS, environment, save
 
-from rtcd_jax.backend import prepare_jax
+from rtcd_jax.system.devices import prepare_jax
 
 
 def main() -> None:
@@ -19,8 +19,8 @@ def main() -> None:
     parser.add_argument("--results", type=Path, default=RESULTS, help="folder of the JSON file")
     arguments = parser.parse_args()
     prepare_jax(1)
-    from rtcd_jax.config import load
-    from rtcd_jax.scale.stages import stages
+    from rtcd_jax.analysis.scale.stages import stages
+    from rtcd_jax.config.load import load
 
     rows = []
     print(f"{'stage':30}{'compilation [s]':>16}{'CPU ms a candidate':>20}")

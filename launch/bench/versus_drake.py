@@ -17,7 +17,7 @@ import classical
 import numpy as np
 from measure import CONFIG, RESULTS, environment, measure_pipeline, save
 
-from rtcd_jax.config import Config, load
+from rtcd_jax.config.load import Config, load
 
 # mass [kg], length [m], diagonal of Q, R: Girlanda et al., section III
 PAPER = {

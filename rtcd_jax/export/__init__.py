@@ -15,11 +15,11 @@ import jax
 import numpy as np
 import yaml
 
-from rtcd_jax.errors import UserError
+from rtcd_jax.elite.records import require_elites
 from rtcd_jax.export import robot, source, tables
 from rtcd_jax.export.bundle import Bundle, certificate_path, read_bundle
-from rtcd_jax.files import is_temporary, plain, replace, replace_json, writing
-from rtcd_jax.records import require_elites
+from rtcd_jax.system.errors import UserError
+from rtcd_jax.system.files import is_temporary, plain, replace, replace_json, writing
 
 FORMAT = "rtcd_jax export"
 VERSION = 1

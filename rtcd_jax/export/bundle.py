@@ -12,14 +12,14 @@ import jax
 import numpy as np
 from jaxtyping import Float, Int
 
-from rtcd_jax.errors import UserError
+from rtcd_jax.elite.closed_loop import fastest_rate
+from rtcd_jax.elite.elite import Elite
+from rtcd_jax.elite.funnel import Tube
+from rtcd_jax.elite.records import read_elite
 from rtcd_jax.plants import plant_class
 from rtcd_jax.plants.base import Plant
 from rtcd_jax.plants.mjx import CpuDynamics, model_of
-from rtcd_jax.records import read_elite
-from rtcd_jax.report.tube import Tube
-from rtcd_jax.verify.elite import Elite
-from rtcd_jax.verify.simulate import fastest_rate
+from rtcd_jax.system.errors import UserError
 
 HOLD = 0.1
 """Longest time for which the input may be held, in time constants of the loop's fastest mode."""

@@ -4,7 +4,7 @@ import json
 
 import pytest
 
-from rtcd_jax.certificate.elite import certify_elite
+from rtcd_jax.certificate.prove.certify import certify_elite
 from tests.certificate import swing
 from tests.certificate.folder import folder_with
 

@@ -1,6 +1,6 @@
 """A run folder as far as certificates read it."""
 
-from rtcd_jax.records import write_elite
+from rtcd_jax.elite.records import write_elite
 
 
 def folder_with(path, arrays, record):

@@ -12,7 +12,7 @@ import pytest
 
 from rtcd_jax.certificate import check
 from rtcd_jax.certificate.check import PI, PI_ERROR, Q, Space, Taylor, polynomial
-from rtcd_jax.certificate.loop import rate
+from rtcd_jax.certificate.prove.closed_loop import rate
 from rtcd_jax.plants import PLANTS
 
 SPACE = Space(2, 4, 5)

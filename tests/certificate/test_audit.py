@@ -8,11 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from rtcd_jax import cli
 from rtcd_jax.certificate import check
-from rtcd_jax.certificate.outside import Cost, elite_of, read_outside
-from rtcd_jax.certificate.repair import defects, repaired
-from rtcd_jax.records import read_elite
+from rtcd_jax.certificate.audit.external import Cost, elite_of, read_outside
+from rtcd_jax.certificate.audit.repair import defects, repaired
+from rtcd_jax.cli import main as cli
+from rtcd_jax.elite.records import read_elite
 from tests.certificate import swing
 
 HEADINGS = "time_s,theta_rad,theta_dot_rad_s,torque_Nm,rho,S11,S12,S22"

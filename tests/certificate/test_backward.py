@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
-from rtcd_jax.certificate import backward
-from rtcd_jax.certificate.levels import SPARED, directions, leveled, merit
+from rtcd_jax.certificate.enlarge import knot_by_knot as backward
+from rtcd_jax.certificate.prove.levels import SPARED, directions, leveled, merit
 from tests.certificate.test_joint import AIMS, loop_of
 
 

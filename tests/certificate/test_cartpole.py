@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from rtcd_jax.certificate import check
-from rtcd_jax.certificate.elite import certify_elite
+from rtcd_jax.certificate.prove.certify import certify_elite
 from tests.certificate import balance
 from tests.certificate.folder import folder_with
 from tests.certificate.loops import Simulated, floats

@@ -5,11 +5,13 @@ import json
 import numpy as np
 import pytest
 
-from rtcd_jax import cli
-from rtcd_jax.certificate import check, descent, elite
-from rtcd_jax.certificate.loop import Loop, claim_of, double, sealed
-from rtcd_jax.certificate.run import certify_run, rank_correlation
-from rtcd_jax.errors import UserError
+from rtcd_jax.certificate import check
+from rtcd_jax.certificate.prove import backward as descent
+from rtcd_jax.certificate.prove import certify as elite
+from rtcd_jax.certificate.prove.closed_loop import Loop, claim_of, double, sealed
+from rtcd_jax.certificate.prove.run import certify_run, rank_correlation
+from rtcd_jax.cli import main as cli
+from rtcd_jax.system.errors import UserError
 from tests.certificate import swing
 from tests.certificate.folder import folder_with
 

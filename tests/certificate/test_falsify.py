@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from rtcd_jax import cli
-from rtcd_jax.certificate import falsify
-from rtcd_jax.certificate.falsify import TOLERANCE, Part, enough_steps, falsify_file, summed
-from rtcd_jax.certificate.motions import Motions
+from rtcd_jax.certificate.falsify import falsify
+from rtcd_jax.certificate.falsify.falsify import TOLERANCE, Part, enough_steps, falsify_file, summed
+from rtcd_jax.certificate.falsify.simulation import Motions
+from rtcd_jax.cli import main as cli
 from tests.certificate import swing
 from tests.certificate.loops import floats
 from tests.certificate.test_check import nudged, resealed

@@ -5,8 +5,8 @@ import pytest
 from scipy.linalg import expm, solve_continuous_are
 
 from rtcd_jax.certificate import check
-from rtcd_jax.certificate.goal import goal_region
-from rtcd_jax.certificate.loop import Loop, claim_of, double, sealed
+from rtcd_jax.certificate.prove.closed_loop import Loop, claim_of, double, sealed
+from rtcd_jax.certificate.prove.goal import goal_region
 from tests.certificate import swing
 from tests.certificate.loops import Simulated
 

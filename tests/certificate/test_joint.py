@@ -3,10 +3,12 @@
 import numpy as np
 import pytest
 
-from rtcd_jax.certificate import check, elite, joint
-from rtcd_jax.certificate.goal import goal_region
-from rtcd_jax.certificate.levels import SHARES, SPARED, directions, goal_level, leveled, merit
-from rtcd_jax.certificate.loop import Loop
+from rtcd_jax.certificate import check
+from rtcd_jax.certificate.enlarge import all_knots as joint
+from rtcd_jax.certificate.prove import certify as elite
+from rtcd_jax.certificate.prove.closed_loop import Loop
+from rtcd_jax.certificate.prove.goal import goal_region
+from rtcd_jax.certificate.prove.levels import SHARES, SPARED, directions, goal_level, leveled, merit
 from tests.certificate import swing
 from tests.certificate.folder import folder_with
 from tests.certificate.test_certify import claimed

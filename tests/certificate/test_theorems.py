@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from rtcd_jax.certificate import check, program
+from rtcd_jax.certificate import check
 from rtcd_jax.certificate.check import Obligation, Q, Refused, Witness, polynomial
+from rtcd_jax.certificate.prove import sdp as program
 
 NOTHING = Q(0)
 

@@ -1,6 +1,6 @@
 """Run folders whose elite 000 moves into the upright, as far as exports read them."""
 
-from rtcd_jax.records import write_elite
+from rtcd_jax.elite.records import write_elite
 from tests.certificate import balance, swing
 
 UNITS = {

@@ -7,8 +7,8 @@ import subprocess
 import numpy as np
 import pytest
 
-from rtcd_jax.verify import witnesses
-from rtcd_jax.verify.simulate import Outcome, _outside, holding, runge_kutta, settling_time, simulate, tracking
+from rtcd_jax.elite.closed_loop import Outcome, _outside, holding, runge_kutta, settling_time, simulate, tracking
+from rtcd_jax.elite.simulators import witnesses
 
 STEPS = 10  # in an interval
 SETTLING_STEPS = 4

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 import yaml
 
-from rtcd_jax.errors import UserError
+from rtcd_jax.elite.records import read_elite
 from rtcd_jax.export import export_run
 from rtcd_jax.export.bundle import read_bundle
-from rtcd_jax.records import read_elite
+from rtcd_jax.system.errors import UserError
 from tests.certificate import swing
 from tests.export.conftest import Silent
 from tests.export.folders import run_folder

@@ -9,9 +9,9 @@ import mujoco
 import numpy as np
 import pytest
 
+from rtcd_jax.elite.simulators import CLOSED_FORMS
 from rtcd_jax.plants import PLANTS, plant_class
 from rtcd_jax.plants.mjx import compile_model
-from rtcd_jax.verify import CLOSED_FORMS
 
 
 def test_energy_changes_by_the_motors_power_less_the_dampers(robot):

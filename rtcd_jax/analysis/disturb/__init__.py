@@ -1,0 +1,68 @@
+"""`rtcd disturb`: the paper's experiments in simulation, the initial candidate beside the best one.
+
+off_nominal   success shares from uniform states of the first ellipsoids (the paper's simulation test)
+impulse       a push during the motion, over its time and size (the paper's hardware test)
+robustness    model errors, noise, delay, slow motors, low control rates, perturbations, and a score
+"""
+
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+from rtcd_jax.analysis.disturb.comparison import Console, Contest, Meter, motions, read_contest, run
+from rtcd_jax.analysis.disturb.experiments import FACTORS, SIZES, TIMES, impulse, off_nominal, robustness, troubles
+from rtcd_jax.analysis.disturb.figures import draw_disturbance
+from rtcd_jax.analysis.disturb.scenarios import Lanes, Outcome
+from rtcd_jax.system.files import make_folder, replace_json
+
+FOLDER = "disturbance"
+
+
+def disturb_run(folder: Path, states: int, seed: int, console: Console) -> None:
+    """Runs all experiments; stores `disturbance/{off_nominal,impulse,robustness}.json` and their figures.
+
+    Raises:
+        UserError: no run folder, a run without elites, or a folder that cannot be read or written.
+    """
+    contest = read_contest(folder, console)
+    place = folder / FOLDER
+    make_folder(place)
+    meter = Meter(console, _all_motions(contest, states))
+
+    def simulate(lanes: Lanes, experiment: str, settles: bool) -> Outcome:
+        return run(contest, lanes, seed, experiment, meter, settles)
+
+    records = {
+        "off_nominal": off_nominal(contest, states, seed, simulate),
+        "impulse": impulse(contest, simulate),
+        "robustness": robustness(contest, seed, simulate),
+    }
+    of_run = {"config_hash": contest.config_hash, "plant": contest.elites[0].plant}
+    for name, record in records.items():
+        replace_json(place / f"{name}.json", of_run | record)
+    pictures = draw_disturbance(folder)
+    for line in _summary(contest, records):
+        console.message(line)
+    console.message(f"{len(records)} records and {len(pictures)} figures in {place}")
+
+
+def _all_motions(contest: Contest, states: int) -> int:
+    loops = len(contest.names)
+    robust = sum(len(trouble.levels) * trouble.repeats for trouble in troubles(contest))
+    return sum(map(motions, (len(FACTORS) * loops**2 * states, loops * TIMES * SIZES, loops * robust)))
+
+
+def _summary(contest: Contest, records: Mapping[str, Mapping[str, Any]]) -> Iterator[str]:
+    off, push, robust = (records[name]["summary"] for name in ("off_nominal", "impulse", "robustness"))
+    heading = "".join(f"{name:>12}" for name in contest.names)
+    yield f"{'arrived from (sampled)':30}{heading}"
+    for place, shares in off.items():
+        yield f"  {place:28}" + "".join(f"{shares[name]:12.1%}" for name in contest.names)
+    yield f"{'pushes':30}{heading}"
+    yield f"{'  recovered':30}" + "".join(f"{push[name]['recovered']:12.1%}" for name in contest.names)
+    largest = "".join(f"{push[name]['largest_at_all_times']:12.3g}" for name in contest.names)
+    yield f"{f'  all borne up to [{contest.plant.input_units[0]} s]':30}{largest}"
+    yield f"{'robustness':30}{heading}"
+    for criterion in robust[contest.names[0]]:
+        shares = "".join(f"{robust[name][criterion]:12.1%}" for name in contest.names)
+        yield f"  {criterion:28}{shares}"

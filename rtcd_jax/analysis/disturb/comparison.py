@@ -1,0 +1,186 @@
+"""The controllers that are compared, and what runs their lanes in batches, with progress."""
+
+import math
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Protocol, final
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from rtcd_jax.analysis.disturb.scenarios import (
+    CHUNK,
+    STEP,
+    WATCHED,
+    Lanes,
+    Loops,
+    Outcome,
+    advance,
+    start,
+    steps_of,
+)
+from rtcd_jax.elite.closed_loop import ARRIVED, FORGOTTEN, settling_time
+from rtcd_jax.elite.elite import Elite
+from rtcd_jax.elite.records import read_elite, require_elites
+from rtcd_jax.plants import plant_class
+from rtcd_jax.plants.base import Plant
+from rtcd_jax.plants.mjx import CpuDynamics, model_of
+from rtcd_jax.system.errors import UserError
+
+BATCH = 2048
+"""Lanes in the compiled program."""
+TELLING = 0.02
+"""Share of the work from which on the time that is left can be told; before it, most was compilation."""
+REPORTED = 5.0
+"""Least time between two lines of progress [s]."""
+
+
+class Console(Protocol):
+    def message(self, text: str, /) -> None: ...
+    def progress(self, now: Any, /) -> None: ...
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Contest:
+    """C closed loops of one run, by name; `plant` and `design` have leaves [C]; `horizon` [s] is for all motions.
+
+    `config_hash` is that of the run.
+    """
+
+    names: tuple[str, ...]
+    elites: tuple[Elite, ...]
+    plant: Plant
+    design: Any
+    loops: Loops
+    horizon: float
+    config_hash: str | None
+
+    @property
+    def indices(self) -> dict[str, int]:
+        return {name: index for index, name in enumerate(self.names)}
+
+
+@final
+@dataclass(frozen=True)
+class Progress:
+    """All experiments together; `generation` of `generations` thousandths are done."""
+
+    generation: int
+    generations: int
+    experiment: str
+    elapsed: float
+
+    def __str__(self) -> str:
+        share = self.generation / self.generations
+        left = f"  left {self.elapsed * (1 - share) / share:.0f} s" if share >= TELLING else ""
+        return f"{self.experiment:12} {share:4.0%}  elapsed {self.elapsed:.0f} s{left}"
+
+
+@final
+class Meter:
+    """Tells a console how much of all motions is done; of `motions` of `seconds` each."""
+
+    def __init__(self, console: Console, motions: int):
+        self._console, self._motions = console, motions
+        self._done = 0.0
+        self._began = self._told = time.monotonic()
+
+    def tick(self, experiment: str, motions: float) -> None:
+        """That so many more motions are over."""
+        self._done += motions
+        now = time.monotonic()
+        if now - self._told >= REPORTED:
+            self._told = now
+            share = min(1000, round(1000 * self._done / self._motions))
+            self._console.progress(Progress(share, 1000, experiment, now - self._began))
+
+
+def read_contest(folder: Path, console: Console) -> Contest:
+    """The initial candidate beside the best elite of a run folder; an initial one without a funnel is left out.
+
+    Raises:
+        UserError: no elites, or a folder that cannot be read.
+    """
+    require_elites(folder)
+    read: dict[str, tuple[Elite, dict[str, Any]]] = {}
+    for name, place, file in (("initial", folder, "initial"), ("best", folder / "elites", "000")):
+        arrays, record = read_elite(place, file)
+        if record.get("status") == "OK":
+            read[name] = Elite.of(arrays, record), record
+        else:
+            console.message(f"{name}: left out, it has no funnel ({record.get('status')})")
+    if "best" not in read:
+        raise UserError(f"{folder} has no elite with a funnel to disturb")
+    return contest_of({name: elite for name, (elite, _) in read.items()}, read["best"][1].get("config_hash"))
+
+
+def contest_of(elites: dict[str, Elite], config_hash: str | None) -> Contest:
+    """Elites of the same run, by name."""
+    robots = [plant_class(elite.plant).from_parameters(elite.parameters) for elite in elites.values()]
+    rates, ends = [], []
+    for elite, (plant, design) in zip(elites.values(), robots, strict=True):
+        rate = jax.vmap(lambda x, u, plant=plant, design=design: plant.dynamics(design, x, u))
+        rates.append(np.stack([np.asarray(rate(side, elite.u)) for side in (elite.x[:-1], elite.x[1:])], axis=1))
+        columns = elite.x_goal.size + elite.u_max.size
+        witness = CpuDynamics(model_of(elite.plant, elite.parameters), columns)
+        ends.append(elite.time[-1] + settling_time(elite, witness))
+    plant, design = jax.tree.map(lambda *leaves: jnp.stack([jnp.asarray(leaf, float) for leaf in leaves]), *robots)
+    loops = Loops.of(list(elites.values()), rates)
+    return Contest(tuple(elites), tuple(elites.values()), plant, design, loops, max(ends), config_hash)
+
+
+def run(contest: Contest, lanes: Lanes, seed: int, experiment: str, meter: Meter, settles: bool) -> Outcome:
+    """What became of every lane; `settles` lets a batch end as soon as all of its lanes have left or arrived.
+
+    The same lanes and seed give the same outcome.
+    """
+    count = lanes.loop.shape[0]
+    parts = []
+    for index, begin in enumerate(range(0, count, BATCH)):
+        which = np.minimum(begin + np.arange(BATCH), count - 1)
+        batch = jax.tree.map(lambda leaf, which=which: leaf[..., which], lanes)
+        key = jax.random.fold_in(jax.random.key(seed), index)
+        part = _run_batch(contest, batch, key, settles, lambda share: meter.tick(experiment, BATCH * share))
+        real = min(BATCH, count - begin)
+        parts.append([np.asarray(leaf)[:real] for leaf in part])
+    return Outcome(*(np.concatenate(leaves) for leaves in zip(*parts, strict=True)))
+
+
+def motions(lanes: int) -> int:
+    """Those that `run` simulates, full batches of them."""
+    return BATCH * math.ceil(lanes / BATCH)
+
+
+def _run_batch(contest: Contest, batch: Lanes, key, settles: bool, tick) -> Outcome:
+    total, watched = steps_of(contest.horizon), steps_of(WATCHED)
+    quiet = _quiet_from(contest, batch)
+    motion, held = start(contest.loops, batch), jnp.zeros(batch.loop.shape)
+    final = held
+    for first in range(0, total, CHUNK):
+        motion = advance(contest.loops, batch, motion, jnp.asarray(first), key)
+        final = contest.loops.distance(batch.loop, motion.x)
+        if first + CHUNK > total - watched:
+            held = jnp.maximum(held, final)
+        over = settles and first * STEP > quiet and bool(jnp.all(motion.left | (final <= FORGOTTEN * ARRIVED)))
+        tick((total - first if over else CHUNK) / total)
+        if over:
+            held = final
+            break
+    return Outcome(*(np.asarray(leaf) for leaf in (motion.left, final, held)))
+
+
+def _quiet_from(contest: Contest, batch: Lanes) -> float:
+    """The time from which on nothing but the goal's LQR acts [s]."""
+    last_knot = max(elite.time[-1] for elite in contest.elites)
+    pushed = jnp.any(batch.heights != 0, axis=1)
+    last_push = jnp.max(jnp.where(pushed, batch.centers + 6 * batch.widths, 0.0))
+    return max(float(last_push), float(last_knot))
+
+
+def by_loop(contest: Contest, values: np.ndarray) -> Iterator[tuple[str, np.ndarray]]:
+    """`values` [C ...] by the loops' names."""
+    return zip(contest.names, values, strict=True)

@@ -1,0 +1,290 @@
+"""The experiments: off-nominal starts, pushes during the motion, and a robot that is not as the model says.
+
+Every experiment gives a record for its JSON file, with a `summary` in it. What counts as recovered:
+
+    off-nominal, impulse   stays inside the limits and ends with V <= 0.001 rho_N, as `rtcd verify` asks for
+    robustness             stays inside the limits and in the last second inside the goal's region, V <= rho_N:
+                           noise that never ends lets nothing settle
+"""
+
+import dataclasses
+import math
+from collections.abc import Callable, Iterator, Mapping
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from rtcd_jax.analysis.disturb.comparison import Contest, by_loop
+from rtcd_jax.analysis.disturb.scenarios import LONGEST_DELAY, PULSES, STEP, Lanes, Outcome, undisturbed
+from rtcd_jax.analysis.verify.verification import clopper_pearson
+from rtcd_jax.elite.closed_loop import ARRIVED
+from rtcd_jax.elite.elite import Elite
+
+CONFIDENCE = 0.95
+"""Of the two-sided intervals of the shares."""
+
+FACTORS = 1, 2, 4, 8, 16
+"""By which the first ellipsoids are enlarged, in every direction."""
+
+TIMES, SIZES = 40, 41
+"""Of the pushes: cells of the heat map."""
+PUSH_WIDTH = 0.02
+"""Standard deviation of a push's bell [s]."""
+LARGEST_PUSH = 0.3
+"""Impulse of the largest push over the input limit [s]."""
+
+LEVELS = 21
+"""Of every trouble, from none to the largest (RealAIGym: N_var)."""
+REPEATS = 10
+"""Motions with noises of their own at each level."""
+MODEL_ERROR = 0.25
+"""Largest relative error of a parameter (RealAIGym: 0.75 to 1.25)."""
+VELOCITY_NOISE = 0.1
+"""Largest standard deviation over the joint's largest nominal speed."""
+INPUT_NOISE = 0.2
+"""Largest standard deviation over the input limit (RealAIGym: 1.1 of 6 N m)."""
+LAG = 0.1
+"""Largest time constant of the motor [s] (RealAIGym's slowest, 0.1 of the way in 2 ms, has 19 ms)."""
+DELAY = LONGEST_DELAY
+"""Largest delay of the measurements [s] (RealAIGym: 40 ms)."""
+PROFILES = 50
+"""Random sequences of pulses (RealAIGym's), each of `PULSES`."""
+PULSE_WIDTHS = 0.05, 0.1
+"""Standard deviation of a pulse's bell [s] (RealAIGym's)."""
+PULSE_HEIGHTS = 0.08, 0.83
+"""Of a pulse, over the input limit (RealAIGym: 0.5 to 5 of 6 N m)."""
+RATES = 1000, 500, 250, 200, 125, 100, 50
+"""Of the controller [Hz]."""
+SCORED = "model", "velocity noise", "torque noise", "response", "delay", "perturbation"
+"""The criteria whose mean is the score."""
+
+Simulate = Callable[[Lanes, str, bool], Outcome]
+"""Lanes, the experiment's name, whether they may end early -> what became of them."""
+
+
+def off_nominal(contest: Contest, states: int, seed: int, simulate: Simulate) -> dict[str, Any]:
+    """Shares of uniform states of the first ellipsoids, and of enlarged ones, from which each controller arrives.
+
+    Both controllers start from the same states, those of either funnel. An ellipsoid itself tests the promise, an
+    enlarged one what lies beyond it; of these only states inside the limits are drawn.
+    """
+    random = np.random.default_rng(seed)
+    places = [(name, factor) for name in contest.names for factor in FACTORS]
+    starts = [_starts(contest.elites[contest.indices[name]], factor, states, random) for name, factor in places]
+    loops = len(contest.names)
+    x = np.repeat(np.stack(starts), loops, axis=0).reshape(-1, starts[0].shape[1])
+    loop = np.tile(np.repeat(np.arange(loops), states), len(places))
+    outcome = simulate(undisturbed(contest.plant, contest.design, loop, x.T), "off-nominal", True)
+    arrived = _arrived(outcome).reshape(len(places), loops, states)
+    return {
+        "experiment": "uniform states of the first ellipsoids (sampled rung), and of ellipsoids enlarged by a factor",
+        "states": states,
+        "seed": seed,
+        "confidence": CONFIDENCE,
+        "factors": FACTORS,
+        "summary": {
+            f"{name} ellipsoid x {factor}": dict(_shares(contest, cells))
+            for (name, factor), cells in zip(places, arrived, strict=True)
+        },
+    }
+
+
+def _starts(elite: Elite, factor: float, states: int, random: np.random.Generator) -> np.ndarray:
+    """Uniform states [states n] of the first ellipsoid, enlarged, as far as it lies inside the limits."""
+    found = np.empty((0, elite.x_goal.size))
+    while len(found) < states:
+        drawn = elite.x[0] + factor * (elite.points(np.zeros(states, int), random) - elite.x[0])
+        found = np.concatenate([found, drawn[np.all(np.abs(drawn) <= elite.state_limits, axis=1)]])
+    return found[:states]
+
+
+def _shares(contest: Contest, arrived: np.ndarray) -> Iterator[tuple[str, float]]:
+    """Each controller's share of successes with both ends of its interval."""
+    for name, row in by_loop(contest, arrived):
+        failures, trials = int((~row).sum()), len(row)
+        lower, upper = clopper_pearson(failures, trials, (1 + CONFIDENCE) / 2)
+        yield from {name: 1 - failures / trials, f"{name} lower": 1 - upper, f"{name} upper": 1 - lower}.items()
+
+
+def impulse(contest: Contest, simulate: Simulate) -> dict[str, Any]:
+    """For a bell-shaped push on the first input, over its time and its impulse: recovered or lost, each controller.
+
+    Times are from the first whole push to the last knot, the same shares of that for each controller.
+    """
+    shares = np.linspace(0, 1, TIMES)
+    limit = float(contest.elites[0].u_max[0])
+    impulses = np.linspace(-1, 1, SIZES) * LARGEST_PUSH * limit
+    first = 3 * PUSH_WIDTH
+    times = np.stack([first + shares * (elite.time[-1] - first) for elite in contest.elites])
+    loop, when, size = (axis.ravel() for axis in np.indices((len(times), TIMES, SIZES)))
+    lanes = _from_start(contest, loop)
+    heights = np.zeros(lanes.heights.shape)
+    heights[0, 0] = impulses[size] / (PUSH_WIDTH * math.sqrt(2 * math.pi))
+    lanes = dataclasses.replace(
+        lanes,
+        centers=lanes.centers.at[0].set(times[loop, when]),
+        widths=lanes.widths.at[0].set(PUSH_WIDTH),
+        heights=jnp.asarray(heights),
+    )
+    recovered = _arrived(simulate(lanes, "impulse", True)).reshape(len(times), TIMES, SIZES)
+    return {
+        "experiment": f"a push on the first input, a bell with a standard deviation of {PUSH_WIDTH:g} s",
+        "impulse_unit": f"{contest.plant.input_units[0]} s",
+        "times": dict(by_loop(contest, times)),
+        "impulses": impulses,
+        "recovered": dict(by_loop(contest, recovered)),
+        "summary": {
+            name: {"recovered": cells.mean(), "largest_at_all_times": _bearable(impulses, cells)}
+            for name, cells in by_loop(contest, recovered)
+        },
+    }
+
+
+class Trouble(NamedTuple):
+    """One way in which the robot is not as the model says: `apply(lanes, level [L], random) -> lanes`.
+
+    `levels` in `unit`; every level is simulated `repeats` times. A criterion's success is that of all its troubles.
+    """
+
+    criterion: str
+    name: str
+    unit: str
+    levels: np.ndarray
+    repeats: int
+    apply: Callable[[Lanes, np.ndarray, np.random.Generator], Lanes]
+
+
+def robustness(contest: Contest, seed: int, simulate: Simulate) -> dict[str, Any]:
+    """Success by trouble and level, and the score: the mean over six criteria of the share of successes.
+
+    The criteria and their ranges follow the RealAIGym benchmark (Wiebe et al., "Open Source Dual-Purpose Acrobot and
+    Pendubot Platform", IEEE Robotics & Automation Magazine 31(2), 2024), the robot and what counts as success are ours.
+    """
+    random = np.random.default_rng(seed)
+    found = troubles(contest)
+    sizes = [len(trouble.levels) * trouble.repeats for trouble in found]
+    loops = len(contest.names)
+    parts = []
+    for trouble in found:
+        level = np.repeat(trouble.levels, trouble.repeats)
+        lanes = _from_start(contest, np.repeat(np.arange(loops), len(level)))
+        parts.append(trouble.apply(lanes, np.tile(level, loops), random))
+    outcome = simulate(_joined(parts), "robustness", False)
+    stayed = np.split(~outcome.left_limits & (outcome.held <= 1), loops * np.cumsum(sizes)[:-1])
+    successes = [part.reshape(loops, len(trouble.levels), -1) for part, trouble in zip(stayed, found, strict=True)]
+    return {
+        "experiment": "the swing-up from its start on a robot that is not as the model says",
+        "seed": seed,
+        "troubles": [
+            {
+                "criterion": trouble.criterion,
+                "name": trouble.name,
+                "unit": trouble.unit,
+                "levels": trouble.levels,
+                "success": {name: part.mean(axis=1) for name, part in by_loop(contest, success)},
+            }
+            for trouble, success in zip(found, successes, strict=True)
+        ],
+        "summary": dict(by_loop(contest, _scores(found, successes, loops))),
+    }
+
+
+def _scores(found: list[Trouble], successes: list[np.ndarray], loops: int) -> np.ndarray:
+    """For each loop, every criterion's mean over its troubles, and the score."""
+    scores: list[dict[str, float]] = []
+    for loop in range(loops):
+        criteria: dict[str, list[float]] = {}
+        for trouble, success in zip(found, successes, strict=True):
+            criteria.setdefault(trouble.criterion, []).append(float(success[loop].mean()))
+        means = {criterion: float(np.mean(shares)) for criterion, shares in criteria.items()}
+        scores.append({"score": float(np.mean([means[criterion] for criterion in SCORED])), **means})
+    return np.array(scores, dtype=object)
+
+
+def troubles(contest: Contest) -> list[Trouble]:
+    """All of them, for the robot of a contest."""
+    elite = contest.elites[0]
+    half = elite.x_goal.size // 2
+    limits = elite.u_max
+    speeds = np.max([np.abs(elite.x[:, half:]).max(axis=0) for elite in contest.elites], axis=0)
+    relative = np.linspace(-MODEL_ERROR, MODEL_ERROR, LEVELS)
+
+    def none_to(largest: float) -> np.ndarray:
+        return np.linspace(0, largest, LEVELS)
+
+    return [
+        *(Trouble("model", name, "relative", relative, 1, change) for name, change in _parameters(contest).items()),
+        Trouble("velocity noise", "velocity noise", "largest nominal speed", none_to(VELOCITY_NOISE), REPEATS,
+                lambda lanes, level, _: dataclasses.replace(lanes, velocity_noise=speeds[:, None] * level)),
+        Trouble("torque noise", "torque noise", "input limit", none_to(INPUT_NOISE), REPEATS,
+                lambda lanes, level, _: dataclasses.replace(lanes, input_noise=limits[:, None] * level)),
+        Trouble("response", "response time", "s", none_to(LAG), 1,
+                lambda lanes, level, _: dataclasses.replace(lanes, lag=jnp.asarray(level))),
+        Trouble("delay", "delay", "s", none_to(DELAY), 1,
+                lambda lanes, level, _: dataclasses.replace(lanes, delay=jnp.asarray(np.round(level / STEP), int))),
+        Trouble("perturbation", "perturbation", "profile", np.arange(PROFILES, dtype=float), 1,
+                lambda lanes, level, random: _perturbed(contest, lanes, random)),
+        Trouble("control rate", "control rate", "Hz", np.array(RATES, float), 1,
+                lambda lanes, rate, _: dataclasses.replace(lanes, period=jnp.asarray(np.round(1 / rate / STEP), int))),
+    ]  # fmt: skip
+
+
+def _parameters(contest: Contest) -> Mapping[str, Callable[[Lanes, np.ndarray, Any], Lanes]]:
+    """What scales each uncertain number of the robot by 1 + level: its design, its constants, its input limit.
+
+    Gravity is known.
+    """
+
+    def scaling(where: Callable[[Lanes], Any]) -> Callable[[Lanes, np.ndarray, Any], Lanes]:
+        return lambda lanes, level, _: eqx.tree_at(where, lanes, where(lanes) * (1 + level))
+
+    constants = [
+        field.name
+        for field in dataclasses.fields(contest.plant)
+        if not field.metadata.get("static") and field.name != "gravity" and not field.name.endswith("_limit")
+    ]
+    return {
+        **{name: scaling(lambda lanes, name=name: getattr(lanes.design, name)) for name in contest.plant.design_units},
+        **{name: scaling(lambda lanes, name=name: getattr(lanes.plant, name)) for name in constants},
+        "input limit": scaling(lambda lanes: lanes.strength),
+    }
+
+
+def _perturbed(contest: Contest, lanes: Lanes, random: np.random.Generator) -> Lanes:
+    """Random pulses, one in each part of the motion, the same for all loops but for the motions' lengths."""
+    inputs = contest.elites[0].u_max
+    shares = (np.arange(PULSES)[:, None] + random.uniform(size=(PULSES, PROFILES))) / PULSES
+    widths = random.uniform(*PULSE_WIDTHS, size=(PULSES, PROFILES))
+    sizes = random.uniform(*PULSE_HEIGHTS, size=(PULSES, len(inputs), PROFILES))
+    heights = inputs[:, None] * sizes * random.choice([-1, 1], size=sizes.shape)
+    durations = np.array([elite.time[-1] for elite in contest.elites])
+    return dataclasses.replace(
+        lanes,
+        centers=jnp.asarray(np.concatenate([shares * duration for duration in durations], axis=1)),
+        widths=jnp.asarray(np.tile(widths, len(durations))),
+        heights=jnp.asarray(np.tile(heights, len(durations))),
+    )
+
+
+def _from_start(contest: Contest, loop: np.ndarray) -> Lanes:
+    """Undisturbed lanes from the nominal motions' first states."""
+    first = np.stack([elite.x[0] for elite in contest.elites])
+    return undisturbed(contest.plant, contest.design, loop, first[loop].T)
+
+
+def _joined(parts: list[Lanes]) -> Lanes:
+    return jax.tree.map(lambda *leaves: jnp.concatenate(leaves, axis=-1), *parts)
+
+
+def _arrived(outcome: Outcome) -> np.ndarray:
+    return ~outcome.left_limits & (outcome.final <= ARRIVED)
+
+
+def _bearable(impulses: np.ndarray, recovered: np.ndarray) -> float:
+    """The largest |impulse| up to which all pushes, to both sides and at all times, were recovered from."""
+    lost = np.abs(impulses)[~recovered.all(axis=0)]
+    borne = np.abs(impulses)[np.abs(impulses) < lost.min()] if lost.size else np.abs(impulses)
+    return float(borne.max(initial=0.0))

@@ -1,0 +1,236 @@
+"""Many disturbed motions of a run's closed loops at once: every lane has a robot, a controller and troubles of its own.
+
+The robot is the plant's closed form with the lane's true parameters, by Runge-Kutta steps of `STEP`, its input held in
+each. The controller knows nothing of what is wrong: at its own rate it evaluates the loop's law, from the state of a
+while ago and with noise on the velocities; what it asks for lags, is noisy, and ends at the robot's true limits.
+"""
+
+import math
+from collections.abc import Sequence
+from functools import partial
+from typing import Any, NamedTuple, final
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from rtcd_jax.elite.elite import Elite
+from rtcd_jax.numerics.integrate import rk4_step, split
+from rtcd_jax.plants.base import Plant
+
+STEP = 1e-3
+"""Of the integration [s]; control periods and delays are multiples of it."""
+LONGEST_DELAY = 0.1
+"""Of the measurements [s]."""
+PULSES = 3
+"""Bell-shaped pushes that a lane can take."""
+CHUNK = 250
+"""Steps between two looks from outside."""
+WATCHED = 1.0
+"""Time at the end in which a motion must hold its place [s]."""
+
+
+@final
+class Loops(eqx.Module):
+    """The controllers of C elites as one table, a row for each interval and one for the goal behind them.
+
+    A row holds the cubics of x*(t) [n 4], K [m n] at the interval's start and its change over it, and u* [m].
+    """
+
+    rows: Float[Array, "C*(N+1) F"]
+    dt: Float[Array, " C"]
+    goal: Float[Array, " n"]
+    goal_shape: Float[Array, "C n n"]
+    input_limits: Float[Array, " m"]
+    state_limits: Float[Array, " n"]
+    intervals: int = eqx.field(static=True)
+
+    @classmethod
+    def of(cls, elites: Sequence[Elite], rates: Sequence[np.ndarray]) -> "Loops":
+        """Those of elites of one run; `rates` [N 2 n] are x*' at both ends of every interval."""
+        first = elites[0]
+        return cls(
+            rows=jnp.asarray(np.concatenate([_rows(*pair) for pair in zip(elites, rates, strict=True)])),
+            dt=jnp.asarray([elite.time[1] for elite in elites]),
+            goal=jnp.asarray(first.x_goal),
+            goal_shape=jnp.asarray([elite.S[-1] / elite.rho[-1] for elite in elites]),
+            input_limits=jnp.asarray(first.u_max),
+            state_limits=jnp.asarray(first.state_limits),
+            intervals=len(first.u),
+        )
+
+    def law(self, which: Int[Array, " L"], t: Float[Array, ""], x: tuple) -> list:
+        """u [m] x [L] = clip(u* - K (x - x*)) at time t."""
+        n, m = self.goal.size, self.input_limits.size
+        place = t / self.dt[which]
+        k = jnp.minimum(jnp.floor(place).astype(int), self.intervals)
+        s = place - k
+        row = self.rows[which * (self.intervals + 1) + k]
+        cubics, gains, changes, feedforward = (
+            row[:, start:end] for start, end in _spans(4 * n, m * n, m * n, m)
+        )  # fmt: skip
+        error = []
+        for i in range(n):
+            c0, c1, c2, c3 = (cubics[:, 4 * i + power] for power in range(4))
+            error.append(x[i] - (c0 + s * (c1 + s * (c2 + s * c3))))
+        u = []
+        for j in range(m):
+            terms = ((gains[:, j * n + i] + s * changes[:, j * n + i]) * error[i] for i in range(n))
+            u.append(jnp.clip(feedforward[:, j] - sum(terms), -self.input_limits[j], self.input_limits[j]))
+        return u
+
+    def inside(self, x: Float[Array, "n L"]) -> Bool[Array, " L"]:
+        """Whether the states keep the limits; what is no number does not."""
+        return jnp.all(jnp.abs(x) <= jnp.minimum(self.state_limits, jnp.finfo(x.dtype).max)[:, None], axis=0)
+
+    def distance(self, which: Int[Array, " L"], x: Float[Array, "n L"]) -> Float[Array, " L"]:
+        """V / rho of the goal's region."""
+        error = x - self.goal[:, None]
+        return jnp.einsum("il,lij,jl->l", error, self.goal_shape[which], error)
+
+
+@final
+class Lanes(eqx.Module):
+    """L motions and what troubles them; leaves [L], with the states' or inputs' axis before it.
+
+    `loop` is the controller's index and `x` the state at t = 0. Of the robot: `plant` and `design` with its true
+    numbers, and `strength`, its true input limit over the nominal one. Of the controller: the control period and the
+    delay [steps], noise on the velocities (standard deviation [n/2]). Of the motor: `lag`, the time constant [s], noise
+    (standard deviation [m]). Pulses on the inputs: center [s], width (standard deviation [s]) and height.
+    """
+
+    loop: Int[Array, " L"]
+    x: Float[Array, "n L"]
+    plant: Plant
+    design: Any
+    strength: Float[Array, " L"]
+    period: Int[Array, " L"]
+    delay: Int[Array, " L"]
+    velocity_noise: Float[Array, "n/2 L"]
+    input_noise: Float[Array, "m L"]
+    lag: Float[Array, " L"]
+    centers: Float[Array, "J L"]
+    widths: Float[Array, "J L"]
+    heights: Float[Array, "J m L"]
+
+
+@final
+class Motion(eqx.Module):
+    """Where the lanes are: state, what the motors give and are asked for, their noise, past states, who left."""
+
+    x: Float[Array, "n L"]
+    input: Float[Array, "m L"]
+    command: Float[Array, "m L"]
+    noise: Float[Array, "m L"]
+    past: Float[Array, "D n L"]
+    left: Bool[Array, " L"]
+
+
+class Outcome(NamedTuple):
+    """Of every lane: whether it left the limits; V/rho at the goal in the end, and its largest in the last second."""
+
+    left_limits: np.ndarray
+    final: np.ndarray
+    held: np.ndarray
+
+
+def undisturbed(plant: Plant, design: Any, loop: np.ndarray, x: np.ndarray) -> Lanes:
+    """Lanes from states [n L] without any trouble; leaves of `plant` and `design` [C] are those of the loops."""
+    count, n, m = len(loop), plant.n, plant.m
+
+    def zeros(*shape: int) -> jax.Array:
+        return jnp.zeros((*shape, count))
+
+    own = jax.tree.map(lambda leaf: jnp.asarray(leaf)[loop], (plant, design))
+    return Lanes(
+        loop=jnp.asarray(loop),
+        x=jnp.asarray(x),
+        plant=own[0],
+        design=own[1],
+        strength=jnp.ones(count),
+        period=jnp.ones(count, int),
+        delay=jnp.zeros(count, int),
+        velocity_noise=zeros(n // 2),
+        input_noise=zeros(m),
+        lag=zeros(),
+        centers=zeros(PULSES),
+        widths=jnp.ones((PULSES, count)),
+        heights=zeros(PULSES, m),
+    )
+
+
+def start(loops: Loops, lanes: Lanes) -> Motion:
+    """All lanes at t = 0, where the delayed measurements say that they have always been."""
+    delays = round(LONGEST_DELAY / STEP) + 1
+    nothing = jnp.zeros_like(lanes.input_noise)
+    past = jnp.broadcast_to(lanes.x, (delays, *lanes.x.shape))
+    return Motion(lanes.x, nothing, nothing, nothing, past, ~loops.inside(lanes.x))
+
+
+@jax.jit
+def advance(loops: Loops, lanes: Lanes, motion: Motion, first: Int[Array, ""], key: jax.Array) -> Motion:
+    """The lanes after `CHUNK` more steps, from step `first` on; a lane that left the limits stays where it did."""
+    noisy = jnp.any(lanes.velocity_noise > 0) | jnp.any(lanes.input_noise > 0)
+    follow = jnp.where(lanes.lag > 0, -jnp.expm1(-STEP / jnp.maximum(lanes.lag, STEP * 1e-3)), 1.0)
+
+    def step(motion: Motion, index):
+        t = index * STEP
+        past = motion.past.at[index % len(motion.past)].set(motion.x)
+        command, noise = _decide(loops, lanes, motion, past, index, key, noisy)
+        given = motion.input + follow * (command - motion.input)
+        bound = lanes.strength * loops.input_limits[:, None]
+        pushed = jnp.clip(given + noise, -bound, bound) + _pushes(lanes, t + STEP / 2)
+        x = rk4_step(partial(_slope, lanes), split(motion.x), pushed, STEP)
+        moved = jnp.where(motion.left, motion.x, jnp.stack(x))
+        return Motion(moved, given, command, noise, past, motion.left | ~loops.inside(moved)), None
+
+    return jax.lax.scan(step, motion, first + jnp.arange(CHUNK))[0]
+
+
+def _decide(loops: Loops, lanes: Lanes, motion: Motion, past, index, key, noisy):
+    """What the controllers ask for after step `index`, and the motors' noise: new where a control period begins."""
+    count = len(lanes.loop)
+    seen = past[(index - lanes.delay) % len(past), :, jnp.arange(count)].T
+    m, half = loops.input_limits.size, loops.goal.size // 2
+
+    def draw():
+        return jax.random.normal(jax.random.fold_in(key, index), (half + m, count))
+
+    random = jax.lax.cond(noisy, draw, lambda: jnp.zeros((half + m, count)))
+    seen = seen.at[half:].add(lanes.velocity_noise * random[:half])
+    due = index % lanes.period == 0
+    asked = jnp.stack(loops.law(lanes.loop, index * STEP, split(seen)))
+    return jnp.where(due, asked, motion.command), jnp.where(due, lanes.input_noise * random[half:], motion.noise)
+
+
+def _pushes(lanes: Lanes, t) -> Float[Array, "m L"]:
+    bells = jnp.exp(-0.5 * ((t - lanes.centers) / lanes.widths) ** 2)
+    return jnp.sum(lanes.heights * bells[:, None], axis=0)
+
+
+def _slope(lanes: Lanes, x: tuple, u):
+    return split(lanes.plant.dynamics(lanes.design, jnp.stack(x), u))
+
+
+def _rows(elite: Elite, rates: np.ndarray) -> np.ndarray:
+    """[N+1 F]."""
+    x, h = elite.x, elite.time[1]
+    begin, end, first, last = x[:-1], x[1:], h * rates[:, 0], h * rates[:, 1]
+    cubics = np.stack([begin, first, 3 * (end - begin) - 2 * first - last, 2 * (begin - end) + first + last], axis=2)
+    gains = elite.K.reshape(len(x), -1)
+    moving = [cubics.reshape(len(begin), -1), gains[:-1], np.diff(gains, axis=0), elite.u]
+    still = np.stack([elite.x_goal, *3 * [0 * elite.x_goal]], axis=1).ravel()
+    holding = [still, elite.K_goal.ravel(), 0 * elite.K_goal.ravel(), 0 * elite.u_max]
+    return np.concatenate([np.concatenate(moving, axis=1), np.concatenate(holding)[None]])
+
+
+def _spans(*sizes: int) -> list[tuple[int, int]]:
+    ends = np.cumsum(sizes).tolist()
+    return list(zip([0, *ends], ends, strict=False))
+
+
+def steps_of(seconds: float) -> int:
+    """Whole chunks of steps that last at least so long."""
+    return CHUNK * math.ceil(seconds / STEP / CHUNK)

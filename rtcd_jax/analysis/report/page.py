@@ -1,0 +1,248 @@
+"""`rtcd report`: one HTML page that needs nothing but itself, and the same figures for print.
+
+plotly.js, the data, style and script stand in the page, whose security policy forbids every request. Tables sort by
+a click on a heading.
+"""
+
+import base64
+import dataclasses
+import html
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+from rtcd_jax.analysis.report import tables
+from rtcd_jax.analysis.report.funnels import draw_funnels, draw_levels, draw_over
+from rtcd_jax.analysis.report.plots import plots
+from rtcd_jax.analysis.report.progress import draw_convergence, draw_courses
+from rtcd_jax.analysis.report.reading import Experiment, Run, compared, read_run
+from rtcd_jax.analysis.report.tables import Cell, Table
+from rtcd_jax.analysis.report.words import NONE, duration, listed, ratio, rung, words
+from rtcd_jax.system.errors import UserError
+from rtcd_jax.system.files import replace
+
+POLICY = "default-src 'none'; script-src 'unsafe-inline'; style-src 'unsafe-inline'; img-src data: blob:"
+"""What the browser may do: run and show what is in the page."""
+
+LONGEST = 40
+"""Characters of a cell that is not wrapped."""
+_NUMBER, _LONG = ' class="number"', ' class="long"'
+
+
+def report(folders: Sequence[Path], to: Path | None = None) -> list[Path]:
+    """Writes the page of a finished run, or one that compares several, and its figures; the page's path first.
+
+    One run: `report.html` and `figures/` in its folder. Several: `comparison.html` beside the first folder, with
+    `comparison.png` and `.pdf`. `to`, say NAME.html, is another path for the page; then one run's figures are in
+    NAME_figures/ beside it, and the run's folder is only read.
+
+    Raises:
+        UserError: a folder that is no finished run's, runs of different robots, or a path that cannot be written.
+    """
+    runs = [read_run(folder) for folder in folders]
+    if to is not None and to.is_dir():
+        raise UserError(f"--to = {to}: must be a file, and this is a folder")
+    if len(runs) == 1:
+        (run,), page = runs, to or folders[0] / "report.html"
+        drawn = draw_figures(dataclasses.replace(run, figures=to.with_name(f"{to.stem}_figures")) if to else run)
+    else:
+        runs = compared(runs)
+        page = to or folders[0].resolve().parent / "comparison.html"
+        drawn = draw_over(runs, page.parent, page.stem)
+    replace(page, render(runs).encode())
+    return [page, *drawn]
+
+
+def refresh(folder: Path) -> Path | None:
+    """The run's page written anew, with what was proved, verified and tried since; None where there is no page.
+
+    The figures beside it show none of that, and stay. Raises UserError as `report`.
+    """
+    page = folder / "report.html"
+    if not page.is_file():
+        return None
+    replace(page, render([read_run(folder)]).encode())
+    return page
+
+
+def draw_figures(run: Run) -> list[Path]:
+    """The figures of one run, NAME.png and .pdf in `run.figures`. Raises UserError if they cannot be written."""
+    over = draw_over([run], run.figures, "overlay")
+    return over + [path for draw in (draw_funnels, draw_levels, draw_courses, draw_convergence) for path in draw(run)]
+
+
+def render(runs: Sequence[Run]) -> str:
+    """The whole page."""
+    title = html.escape(" and ".join(run.name for run in runs))
+    figures = plots(runs)
+    data = json.dumps(figures, allow_nan=False, separators=(",", ":")).replace("<", "\\u003c")
+    body = "\n".join([_header(runs), *_sections(runs, figures)])
+    return (
+        f'<!doctype html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n<title>{title}</title>\n'
+        f'<meta name="viewport" content="width=device-width, initial-scale=1">\n'
+        f'<meta http-equiv="Content-Security-Policy" content="{POLICY}">\n<link rel="icon" href="data:,">\n'
+        f"<style>\n{_asset('page.css')}</style>\n<script>{_plotly()}</script>\n</head>\n<body>\n<main>\n{body}\n</main>\n"
+        f'<script type="application/json" id="figures">{data}</script>\n<script>\n{_asset("page.js")}</script>\n'
+        "</body>\n</html>\n"
+    )
+
+
+def _header(runs: Sequence[Run]) -> str:
+    first = runs[0].config
+    about = f"{first.plant.name}, {first.trajectory.knots} knots"
+    if len(runs) == 1:
+        search = first.search
+        about += f"; {search.mode} search for the largest {words(search.objective)}, "
+        about += f"{search.generations} generations of {search.population}"
+        cards = "".join(_card(*card) for card in _headlines(runs[0]))
+        told = f'<p class="candidate">{_candidate(runs[0])}</p>'
+    else:
+        cards = "".join(
+            _card(run.name, f"× {_told(_gain(run, 'sum'))}", f"sum over its initial one, {run.best.record['rung']}")
+            for run in runs
+        )
+        told = ""
+    names = " · ".join(html.escape(run.name) for run in runs)
+    head = f'<h1>{names}</h1><p class="about">{html.escape(about)}</p>'
+    return f'<header>{head}{told}<div class="cards">{cards}</div></header>'
+
+
+def _candidate(run: Run) -> str:
+    record = run.best.record
+    design = [listed(name, value, run.config.plant.design[name]) for name, value in record["design"].items()]
+    weights = [listed(name, value) for name, value in record["weights"].items()]
+    options = [listed(name, record["policy"][name]) for name in run.config.policy.variables()]
+    return html.escape("best: " + ", ".join([*design, *weights, *options]))
+
+
+def _headlines(run: Run) -> Iterator[tuple[str, str, str]]:
+    """Name, value and remark of what is looked for first."""
+    objective = run.config.search.objective
+    for name in dict.fromkeys((objective, "sum", "inlet")):
+        searched = ", searched" if name == objective else ""
+        yield f"{words(name)} over initial", f"× {_told(_gain(run, name))}", run.best.record["rung"] + searched
+    yield "swing-up", duration(float(run.best.time[-1])), "of the best, start to goal"
+    found = run.certificates.get("000")
+    yield "proof", found["rung"] if found else "none yet", "of the best's funnel" if found else "rtcd certify"
+    kept = [seen.get("kept") for seen in run.verification.values()]
+    seen = ("promises kept" if all(kept) else "PROMISE BROKEN") if kept else "none yet"
+    yield "verification", seen, "by independent simulators" if kept else "rtcd verify"
+
+
+def _gain(run: Run, volume: str) -> float | None:
+    return ratio(run.best.volumes[volume], run.initial.volumes[volume]) if run.initial else None
+
+
+def _card(name: str, value: str, remark: str) -> str:
+    parts = (("span", name), ("strong", value), ("small", remark))
+    return f'<div class="card">{"".join(f"<{tag}>{html.escape(text)}</{tag}>" for tag, text in parts)}</div>'
+
+
+def _sections(runs: Sequence[Run], figures: Mapping[str, Any]) -> Iterator[str]:
+    alone = runs[0] if len(runs) == 1 else None
+    if alone is None:
+        yield _section("Compared", _table(tables.comparison(runs)))
+    yield _section("Funnels", *_funnels(runs, figures))
+    promise = "" if alone is None else _note(f"The best funnel is {rung(alone.best.record)}.")
+    told = "Ratios are optimal over initial. The sum counts knots, most of them near the goal: look at the inlet too."
+    yield _section("Initial and optimal", _table(tables.gains(runs)), promise, _note(told))
+    if alone:
+        named = [name for name in figures if name.startswith("course")]
+        boxes = "".join(_plot(name, "small") for name in named)
+        yield _section("Search", _plot("convergence", "tall"), _note("Volumes are sampled, as the search saw them."))
+        yield _section("Design and weights", f'<div class="grid">{boxes}</div>')
+        yield _section("Elites", _table(tables.elites(alone)), _note("Click a heading to sort."))
+    else:
+        told = "Sampled volumes, each search's own objective: solid the best so far, dotted each generation's median."
+        yield _section("Search", _plot("convergence"), _note(told))
+    yield _section("Certificates", *_certified(runs))
+    seen = tables.verification(runs)
+    yield _section("Verification", _table(seen) if seen else _note("Nothing yet: rtcd verify RUN."))
+    for run in runs:
+        for found in run.experiments:
+            name = words(found.name) if alone else f"{words(found.name)}: {run.name}"
+            yield _section(f"Disturbance: {name}", _table(tables.experiment(found)), *_pictures(found))
+    yield _section("Provenance", _table(tables.provenance(runs)))
+
+
+def _funnels(runs: Sequence[Run], figures: Mapping[str, Any]) -> Iterator[str]:
+    for run in runs:
+        if run.absence:
+            yield _note(f"{run.name}: {run.absence}" if len(runs) > 1 else f"{run.absence}.")
+    yield (
+        '<label class="moment">ellipsoid at <output>0.00 s</output>'
+        '<input type="range" min="0" max="1" step="0.002" value="0" aria-label="time along the motion"></label>'
+    )
+    named = [name for name in figures if name.startswith("plane")]
+    yield f'<div class="grid wide">{"".join(_plot(name) for name in named)}</div>'
+    yield _note(
+        "Shadows of every knot's ellipsoid on the plane of a coordinate and its velocity. A click in the legend hides."
+    )
+    yield _plot("levels")
+
+
+def _certified(runs: Sequence[Run]) -> Iterator[str]:
+    found = tables.certificates(runs)
+    if found is None:
+        yield _note("Nothing yet: rtcd certify RUN.")
+        return
+    yield _table(found)
+    for run in runs:
+        ranks = tables.ranks(run)
+        if ranks:
+            whose = f"{run.name}: " if len(runs) > 1 else ""
+            told = f"rank correlation of sampled and shown sums over {ranks[1]} elites: {ranks[0]:.3f}"
+            yield _note(whose + told)
+
+
+def _pictures(found: Experiment) -> Iterator[str]:
+    for path in found.pictures:
+        data = base64.b64encode(path.read_bytes()).decode()
+        picture = f'<img src="data:image/png;base64,{data}" alt="{html.escape(words(path.stem))}">'
+        yield f'<div class="scroll">{picture}</div>'
+
+
+def _section(title: str, *parts: str) -> str:
+    return f"<section><h2>{html.escape(title)}</h2>\n{''.join(parts)}\n</section>"
+
+
+def _plot(name: str, size: str = "") -> str:
+    return f'<div class="plot {size}" data-figure="{name}"></div>'
+
+
+def _note(text: str) -> str:
+    return f'<p class="note">{html.escape(text)}</p>'
+
+
+def _table(table: Table) -> str:
+    columns = zip(table.heads, table.numeric, strict=True)
+    heads = "".join(_head(head, numeric) for head, numeric in columns)
+    rows = "\n".join(f"<tr>{''.join(map(_cell, row, table.numeric))}</tr>" for row in table.rows)
+    return f'<div class="scroll"><table>\n<thead><tr>{heads}</tr></thead>\n<tbody>\n{rows}\n</tbody></table></div>'
+
+
+def _head(text: str, numeric: bool) -> str:
+    return f'<th scope="col"{_NUMBER * numeric}><button type="button">{html.escape(text)}</button></th>'
+
+
+def _cell(value: Cell, numeric: bool) -> str:
+    if isinstance(value, str):
+        return f"<td{_LONG * (len(value) > LONGEST)}>{html.escape(value)}</td>"
+    sorted_by = " data-none" if value is None else f' data-value="{value!r}"'
+    return f"<td{_NUMBER * numeric}{sorted_by}>{_told(value)}</td>"
+
+
+def _told(value: float | int | None) -> str:
+    return NONE if value is None else f"{value}" if isinstance(value, int) else f"{value:.4g}"
+
+
+def _asset(name: str) -> str:
+    return resources.files("rtcd_jax.analysis.report").joinpath(name).read_text(encoding="utf-8")
+
+
+def _plotly() -> str:
+    """plotly.js, as its Python package brings it; only the file is read, which saves the import's second."""
+    code = resources.files("plotly").joinpath("package_data/plotly.min.js").read_text(encoding="utf-8")
+    return code.replace("</script", "<\\/script")

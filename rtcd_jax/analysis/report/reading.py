@@ -1,0 +1,211 @@
+"""A finished run as reports show it: everything that its folder holds, checked once and given names."""
+
+import itertools
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, final
+
+import numpy as np
+from jaxtyping import Float
+
+from rtcd_jax.analysis.report.words import VOLUMES
+from rtcd_jax.config.load import Config
+from rtcd_jax.elite.records import elite_names, read_config, read_elite, read_generations, require_elites
+from rtcd_jax.system.errors import UserError
+from rtcd_jax.system.files import read_json
+
+# Okabe and Ito's colors: told apart by all kinds of color vision.
+BLUE, VERMILION = "#0072B2", "#D55E00"
+COLORS = (VERMILION, "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
+"""Of compared runs, in turn."""
+INITIALS = (BLUE, "#5F6B7A", "#8C6D31", "#7A5195")
+"""Of their initial candidates, where they differ."""
+
+
+_OF_A_GENERATION = (
+    "index", "evaluations", "objective", "best", "median", "best_so_far", "feasible", "counts", "sigma", "restarts",
+    "genomes", "volumes",
+)  # fmt: skip
+
+
+@final
+@dataclass(frozen=True)
+class Shown:
+    """What reports tell of one funnel: arrays as in the run folder, `volumes` by name, `record` beside them.
+
+    `label` and `color` are its own in all panels.
+    """
+
+    label: str
+    color: str
+    time: Float[np.ndarray, " knots"]
+    x: Float[np.ndarray, "knots n"]
+    S: Float[np.ndarray, "knots n n"]
+    rho: Float[np.ndarray, " knots"]
+    per_knot: Float[np.ndarray, " knots"]
+    volumes: Mapping[str, float]
+    record: Mapping[str, Any]
+
+    @classmethod
+    def of(cls, label: str, color: str, arrays: Mapping[str, np.ndarray], record: Mapping[str, Any]) -> "Shown":
+        """A funnel from its stored arrays and record. Raises UserError if something is missing."""
+        needed = ["time", "x", "S", "rho", "volumes_per_knot", *(f"volumes_{name}" for name in VOLUMES)]
+        missing = [name for name in needed if name not in arrays]
+        missing += [name for name in ("design", "weights", "rung") if name not in record]
+        if missing:
+            raise UserError(f"the {label} candidate lacks {', '.join(missing)}")
+        volumes = {name: float(arrays[f"volumes_{name}"]) for name in VOLUMES}
+        shapes = {name: arrays[name] for name in ("time", "x", "S", "rho")}
+        return cls(label, color, **shapes, per_knot=arrays["volumes_per_knot"], volumes=volumes, record=record)
+
+
+@final
+@dataclass(frozen=True)
+class Experiment:
+    """`disturbance/NAME.json` and the figures NAME*.png beside it."""
+
+    name: str
+    summary: Mapping[str, Any]
+    pictures: tuple[Path, ...]
+
+
+@final
+@dataclass(frozen=True)
+class Run:
+    """A run folder. `initial` is None where the initial candidate has no funnel, and `absence` says why.
+
+    `figures` is the folder that they are drawn into.
+    """
+
+    path: Path
+    figures: Path
+    name: str
+    config: Config
+    best: Shown
+    initial: Shown | None
+    absence: str
+    generations: Sequence[Mapping[str, Any]]
+    elites: Mapping[str, Mapping[str, Any]]
+    certificates: Mapping[str, Mapping[str, Any] | None]
+    verification: Mapping[str, Mapping[str, Any]]
+    experiments: Sequence[Experiment]
+    provenance: Mapping[str, Any]
+
+    @property
+    def funnels(self) -> list[Shown]:
+        """The initial one, if there is one, and the best."""
+        return [self.best] if self.initial is None else [self.initial, self.best]
+
+    @property
+    def seconds(self) -> float | None:
+        """Wall time of all starts [s], None where one was not recorded."""
+        spent = [start.get("seconds") for start in self.provenance.get("starts", ())]
+        return sum(spent) if spent and None not in spent else None
+
+
+def read_run(path: Path) -> Run:
+    """Everything that a finished run left in its folder.
+
+    Raises:
+        UserError: no run folder, no elites yet, an elite without a funnel or with something missing, or a file that
+            cannot be read.
+    """
+    config, best = read_config(path), read_best(path)
+    initial, absence = read_initial(path)
+    folder = path / "elites"
+    return Run(
+        path=path,
+        figures=path / "figures",
+        name=path.resolve().name,
+        config=config,
+        best=best,
+        initial=initial,
+        absence=absence,
+        generations=read_search(path),
+        elites={name: read_elite(folder, name)[1] for name in elite_names(path)},
+        certificates=_json(path / "certificates" / "summary.json"),
+        verification={file.stem: _json(file) for file in sorted((path / "verification").glob("*.json"))},
+        experiments=tuple(_experiments(path / "disturbance")),
+        provenance=_json(path / "provenance.json"),
+    )
+
+
+def read_best(path: Path) -> Shown:
+    """The best elite. Raises UserError if there is none, or it has no funnel."""
+    require_elites(path)
+    arrays, record = read_elite(path / "elites", "000")
+    if record.get("status") != "OK":
+        raise UserError(f"{path / 'elites'}: 000 has no funnel ({record.get('status')})")
+    return Shown.of("best", VERMILION, arrays, record)
+
+
+def read_initial(path: Path) -> tuple[Shown | None, str]:
+    """The initial candidate's funnel, or None and the reason."""
+    if not (path / "initial.json").is_file():
+        return None, "no initial candidate was stored"
+    arrays, record = read_elite(path, "initial")
+    if record.get("status") != "OK":
+        return None, f"the initial candidate has no funnel ({record.get('status')})"
+    return Shown.of("initial", BLUE, arrays, record), ""
+
+
+def read_search(path: Path) -> list[dict[str, Any]]:
+    """The generations of a run. Raises UserError if there are none."""
+    generations = read_generations(path) if (path / "generations.jsonl").is_file() else []
+    if not generations:
+        raise UserError(f"{path} has no generations yet: begin the run first")
+    for number, record in enumerate(generations, 1):
+        missing = [name for name in _OF_A_GENERATION if name not in record]
+        if missing:
+            raise UserError(f"{path / 'generations.jsonl'}, line {number} lacks {', '.join(missing)}")
+    return generations
+
+
+def compared(runs: Sequence[Run]) -> list[Run]:
+    """The runs with a name and a color of their own each.
+
+    Raises UserError for runs of different robots.
+    """
+    robots = {run.config.plant.name: run.path for run in runs}
+    if len(robots) > 1:
+        told = " and ".join(f"{path} of the {robot}" for robot, path in robots.items())
+        raise UserError(f"runs of one robot can be compared, but there is {told}")
+    names = [run.name for run in runs]
+    found: list[Run] = []
+    for index, run in enumerate(runs):
+        name = run.name if names.count(run.name) == 1 else str(run.path)
+        best = replace(run.best, label=name, color=COLORS[index % len(COLORS)])
+        initial = run.initial and replace(run.initial, label=f"{name}, initial")
+        found.append(replace(run, name=name, best=best, initial=initial))
+    return found
+
+
+def shown(runs: Sequence[Run]) -> list[Shown]:
+    """The funnels that are drawn over one another: what the runs have in common, their initial candidate, once."""
+    initials: list[Shown] = []
+    for run in runs:
+        if run.initial and not any(_same(run.initial, other) for other in initials):
+            initials.append(run.initial)
+    if len(initials) == 1:
+        initials = [replace(initials[0], label="initial")]
+    colors = itertools.cycle(INITIALS)
+    return [*(replace(initial, color=next(colors)) for initial in initials), *(run.best for run in runs)]
+
+
+def _same(first: Shown, second: Shown) -> bool:
+    """Whether two funnels are one candidate's: the same motion and values, however their levels were sampled."""
+    return first.x.shape == second.x.shape and np.allclose(first.x, second.x) and np.allclose(first.S, second.S)
+
+
+def _experiments(folder: Path) -> list[Experiment]:
+    found = []
+    for file in sorted(folder.glob("*.json")):
+        pictures = sorted(folder.glob(f"{file.stem}*.png"))
+        found.append(Experiment(file.stem, _json(file).get("summary", {}), tuple(pictures)))
+    return found
+
+
+def _json(path: Path) -> dict[str, Any]:
+    """The file's content, nothing where there is no file. Raises UserError if it is damaged."""
+    return read_json(path, "remove it, or make it again") if path.is_file() else {}

@@ -1,0 +1,209 @@
+"""Tables of the page: what a run found, proved, verified, and where it came from."""
+
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, final
+
+from rtcd_jax.analysis.report.history import POLICY
+from rtcd_jax.analysis.report.reading import Experiment, Run
+from rtcd_jax.analysis.report.words import VOLUMES, duration, ratio, volume_unit, words
+
+Cell = str | float | int | None
+
+
+@final
+@dataclass(frozen=True)
+class Table:
+    """Rows under headings; numbers stay numbers, so that columns can be sorted."""
+
+    heads: tuple[str, ...]
+    rows: tuple[tuple[Cell, ...], ...]
+
+    @property
+    def numeric(self) -> list[bool]:
+        """Of every column, whether it has numbers alone."""
+        columns = [[row[i] for row in self.rows if row[i] is not None] for i in range(len(self.heads))]
+        return [bool(column) and not any(isinstance(cell, str) for cell in column) for column in columns]
+
+
+def gains(runs: Sequence[Run]) -> Table:
+    """Table I of the paper, (initial, optimal, ratio, time), for all volumes and rungs."""
+    heads = (*_run_head(runs), "volume", "unit", "initial", "optimal", "ratio", "time", "rung")
+    return Table(heads, tuple((*_run_cell(runs, run), *row) for run in runs for row in _gains_of(run)))
+
+
+def comparison(runs: Sequence[Run]) -> Table:
+    """One row a run: what it searched, what it found, with whose proof."""
+    plant = runs[0].config.plant
+    heads = (
+        "run", "searched", *(f"{words(name)} [{unit}]" for name, unit in plant.design.items()),
+        *_weight_heads(runs[0]), *(POLICY[name] for name in _searched_options(runs)), *map(words, VOLUMES),
+        "sum × initial", "rung", "sum shown", "rung shown", "promise",
+        "time",
+    )  # fmt: skip
+    return Table(heads, tuple(_compared(run, _searched_options(runs)) for run in runs))
+
+
+def elites(run: Run) -> Table:
+    """The archive, best first."""
+    plant, options = run.config.plant, _searched_options([run])
+    shown = {name: (found["found"]["sum"], found["rung"]) for name, found in run.certificates.items() if found}
+    heads = (
+        "elite", *(f"{words(name)} [{unit}]" for name, unit in plant.design.items()), *_weight_heads(run),
+        *(POLICY[name] for name in options),
+        *(f"{words(name)} [{volume_unit(run.config, name)}]" for name in VOLUMES), "sum × initial",
+        "largest knot [%]", "swing-up [s]", "ε", "rung", *(["sum shown", "rung shown"] if shown else []),
+    )  # fmt: skip
+    before = run.initial.volumes["sum"] if run.initial else 0.0
+    rows = []
+    for name, record in run.elites.items():
+        volumes = record["volumes"]
+        weights = (*record["weights"]["q"], *record["weights"]["r"])
+        told = (
+            name, *record["design"].values(), *weights, *(record["policy"][name] for name in options),
+            *(volumes[key] for key in VOLUMES),
+            ratio(volumes["sum"], before), 100 * volumes["share_of_largest_knot"], record["duration"],
+            record["epsilon"], record["rung"],
+        )  # fmt: skip
+        rows.append((*told, *shown.get(name, (None, None))) if shown else told)
+    return Table(heads, tuple(rows))
+
+
+def certificates(runs: Sequence[Run]) -> Table | None:
+    """Proved volumes beside sampled ones; None where nothing was proved."""
+    heads = (
+        *_run_head(runs), "elite", "rung", "from [s]", "intervals", "proving",
+        "inlet sampled", "inlet shown", "sum sampled", "sum shown", "sum shown / sampled", "integral sampled",
+        "integral shown",
+    )  # fmt: skip
+    rows = tuple((*_run_cell(runs, run), *row) for run in runs for row in _certified(run))
+    return Table(heads, rows) if rows else None
+
+
+def ranks(run: Run) -> tuple[float, int] | None:
+    """Spearman's correlation of the sampled and the shown sums and the number of elites; None below three."""
+    sums = [(found["sampled"]["sum"], found["found"]["sum"]) for found in run.certificates.values() if found]
+    if len(sums) < 3:
+        return None
+    from scipy.stats import spearmanr
+
+    return float(spearmanr(sums)[0]), len(sums)
+
+
+def verification(runs: Sequence[Run]) -> Table | None:
+    """What the witnesses saw; None before `rtcd verify`."""
+    heads = (
+        *_run_head(runs), "funnel", "witness", "states", "left funnel", "left limits", "missed goal",
+        "failure rate", "at most", "promised", "confidence", "promise",
+    )  # fmt: skip
+    rows = []
+    for run in runs:
+        for name, record in run.verification.items():
+            for witness, seen in record.get("witnesses", {}).items():
+                counts = [seen.get(key) for key in ("left_funnel", "left_limits", "missed_goal", "rate", "rate_upper")]
+                promise = [record.get("epsilon"), record.get("confidence"), "kept" if seen.get("kept") else "BROKEN"]
+                rows.append((*_run_cell(runs, run), name, witness, record.get("states"), *counts, *promise))
+    return Table(heads, tuple(rows)) if rows else None
+
+
+def experiment(found: Experiment) -> Table:
+    """An experiment's summary: a row for each of its mappings, or else one for each of its numbers."""
+    summary = found.summary
+    if summary and all(isinstance(value, Mapping) for value in summary.values()):
+        heads = tuple(dict.fromkeys(key for value in summary.values() for key in value))
+        rows = tuple((words(name), *(_cell(value.get(key)) for key in heads)) for name, value in summary.items())
+        return Table(("", *map(words, heads)), rows)
+    return Table(("", ""), tuple((words(name), _cell(value)) for name, value in summary.items()))
+
+
+def provenance(runs: Sequence[Run]) -> Table:
+    """Which program made the runs, where and when."""
+    heads = (*_run_head(runs), "", "")
+    return Table(heads, tuple((*_run_cell(runs, run), *row) for run in runs for row in _origin(run)))
+
+
+def told_time(run: Run) -> str | None:
+    """Wall time of the run, None where it was not recorded."""
+    return None if run.seconds is None else duration(run.seconds)
+
+
+def _gains_of(run: Run) -> Iterator[tuple[Cell, ...]]:
+    searched = run.config.search.objective
+    order = (searched, *(name for name in VOLUMES if name != searched))
+    for name in order:
+        before, after = run.initial.volumes[name] if run.initial else None, run.best.volumes[name]
+        label = f"{words(name)} (searched)" if name == searched else words(name)
+        times = ratio(after, before) if before is not None else None
+        yield label, volume_unit(run.config, name), before, after, times, told_time(run), run.best.record["rung"]
+    found = run.certificates.get("000") or {"found": {}}
+    for name in order:
+        if name in found["found"]:
+            unit, took = volume_unit(run.config, name), duration(found["seconds"])
+            yield words(name), unit, None, found["found"][name], None, took, found["rung"]
+
+
+def _compared(run: Run, options: Sequence[str]) -> tuple[Cell, ...]:
+    record, config = run.best.record, run.config
+    found = run.certificates.get("000")
+    before = run.initial.volumes["sum"] if run.initial else None
+    kept = [seen.get("kept") for seen in run.verification.values()]
+    return (
+        run.name, f"{words(config.search.objective)}, {config.search.mode}", *record["design"].values(),
+        *record["weights"]["q"], *record["weights"]["r"], *(record["policy"][name] for name in options),
+        *(run.best.volumes[name] for name in VOLUMES),
+        ratio(run.best.volumes["sum"], before) if before is not None else None, record["rung"],
+        *((found["found"]["sum"], found["rung"]) if found else (None, None)),
+        ("kept" if all(kept) else "BROKEN") if kept else None, told_time(run),
+    )  # fmt: skip
+
+
+def _certified(run: Run) -> Iterator[tuple[Cell, ...]]:
+    for name, found in run.certificates.items():
+        if not found:
+            yield name, "no goal region could be shown", *[None] * 10
+            continue
+        sampled, shown = found["sampled"], found["found"]
+        yield (
+            name, found["rung"], found["start"], found["intervals"], duration(found["seconds"]),
+            sampled["inlet"], shown["inlet"], sampled["sum"], shown["sum"], ratio(shown["sum"], sampled["sum"]),
+            sampled["integral"], shown["integral"],
+        )  # fmt: skip
+
+
+def _origin(run: Run) -> Iterator[tuple[Cell, ...]]:
+    search = run.config.search
+    yield "folder", str(run.path)
+    yield "search", f"{search.mode}, {search.generations} generations of {search.population}, seed {search.seed}"
+    yield "time", told_time(run) or "not recorded"
+    yield "configuration", run.provenance.get("config_hash")
+    for number, start in enumerate(run.provenance.get("starts", ()), 1):
+        where = f"{start.get('devices')} × {start.get('device')}, {start.get('precision')}, {start.get('system')}"
+        spent = f", {duration(start['seconds'])}" if "seconds" in start else ""
+        yield f"start {number}", f"{start.get('time')}{spent}, commit {start.get('commit')}, {where}"
+        versions = ", ".join(f"{name} {version}" for name, version in start.get("versions", {}).items())
+        yield f"versions {number}", versions
+
+
+def _searched_options(runs: Sequence[Run]) -> list[str]:
+    """The policy's options that any of the runs searched."""
+    return [name for name in POLICY if any(name in run.config.policy.variables() for run in runs)]
+
+
+def _weight_heads(run: Run) -> list[str]:
+    return [f"{letter}{i + 1}" for letter, found in run.config.weights for i in range(len(found))]
+
+
+def _run_head(runs: Sequence[Run]) -> tuple[str, ...]:
+    return ("run",) if len(runs) > 1 else ()
+
+
+def _run_cell(runs: Sequence[Run], run: Run) -> tuple[str, ...]:
+    return (run.name,) if len(runs) > 1 else ()
+
+
+def _cell(value: Any) -> Cell:
+    """What a table can hold: numbers and words as they are, all else as JSON."""
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    return value if value is None or isinstance(value, str | float | int) else json.dumps(value, ensure_ascii=False)

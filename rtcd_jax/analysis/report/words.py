@@ -1,0 +1,87 @@
+"""What figures, tables and pages have in common: names, units, numbers and rungs in words."""
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from rtcd_jax.config.load import Config
+
+VOLUMES = ("sum", "integral", "inlet", "geometric_mean")
+"""The volumes of a funnel by their stored names."""
+NONE = "–"
+"""Stands where there is no number."""
+
+_GREEK = {"alpha": "α", "beta": "β", "gamma": "γ", "phi": "φ", "psi": "ψ", "theta": "θ"}
+_POWERS = str.maketrans("0123456789", "⁰¹²³⁴⁵⁶⁷⁸⁹")
+
+
+def words(name: str) -> str:
+    """A stored name as it is read."""
+    return name.replace("_", " ")
+
+
+def letter(name: str) -> str:
+    """A state's name, Greek ones as letters and their rates as derivatives: fonts set dots above letters badly."""
+    base = name.removesuffix("_dot")
+    if base not in _GREEK:
+        return name
+    return _GREEK[base] if name == base else f"d{_GREEK[base]}/dt"
+
+
+def quantity(name: str, unit: str) -> str:
+    """An axis' label in matplotlib's mathematics, which sets the dot well."""
+    base = name.removesuffix("_dot")
+    if base not in _GREEK:
+        return f"{name} [{unit}]"
+    drawn = rf"\dot{{\{base}}}" if name != base else rf"\{base}"
+    return f"${drawn}$ [{unit}]"
+
+
+def volume_unit(config: Config, volume: str = "sum") -> str:
+    """That of a volume, the product of the states' units with equal ones as powers; the integral has a second more."""
+    powers = Counter({"s": 1} if volume == "integral" else {})
+    for unit in config.plant.states.values():
+        above, _, below = unit.partition("/")
+        powers[above] += 1
+        powers.subtract([below] if below else [])
+    above, below = (
+        "·".join(name + _power(power) for name, power in signed.items() if power > 0)
+        for signed in (powers, {name: -power for name, power in powers.items()})
+    )
+    return f"{above}/{below}" if below else above
+
+
+def _power(power: int) -> str:
+    return "" if power == 1 else str(power).translate(_POWERS)
+
+
+def rung(record: Mapping[str, Any]) -> str:
+    """What a funnel's record promises; a volume is told with it."""
+    if record["rung"] != "sampled":
+        return str(record["rung"])
+    return (
+        f"sampled: failure probability at each knot ≤ {record['epsilon']:.2g} with confidence {record['confidence']:g}"
+    )
+
+
+def listed(name: str, value: float | Sequence[float], unit: str = "") -> str:
+    """`pole mass = 0.2 kg`, `q = (10, 1)`."""
+    numbers = [f"{number:.3g}" for number in np.atleast_1d(value)]
+    told = numbers[0] if len(numbers) == 1 else f"({', '.join(numbers)})"
+    return f"{words(name)} = {told} {unit}".rstrip()
+
+
+def ratio(after: float, before: float) -> float | None:
+    """`after / before`, None where that says nothing."""
+    return after / before if before > 0 else None
+
+
+def duration(seconds: float) -> str:
+    """`2 h 5 min`, `2 min 13 s`, `7.2 s`."""
+    if seconds < 60:
+        return f"{seconds:.3g} s"
+    minutes, rest = divmod(round(seconds), 60)
+    hours, minutes = divmod(minutes, 60)
+    return f"{hours} h {minutes} min" if hours else f"{minutes} min {rest} s"

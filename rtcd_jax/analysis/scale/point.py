@@ -1,0 +1,90 @@
+"""One point of a scaling study, in a process of its own:
+
+    python -m rtcd_jax.analysis.scale.point CONFIG POPULATION DEVICES REPEATS
+
+Whole generations as a run makes them: asked for, evaluated, told, written. The last line is JSON. On a CPU the process
+keeps to as many cores as it has devices, so that each device is a core. Wall times are [s], memory is [bytes].
+"""
+
+import json
+import os
+import statistics
+import sys
+import tempfile
+from pathlib import Path
+from typing import Any
+
+from rtcd_jax.system.devices import prepare_jax
+
+
+def main(config: str, population: str, devices: str, repeats: str) -> None:
+    if hasattr(os, "sched_setaffinity"):
+        os.sched_setaffinity(0, sorted(os.sched_getaffinity(0))[: int(devices)])
+    prepare_jax(int(devices))
+    print(json.dumps(measure(Path(config), int(population), int(devices), int(repeats))))
+
+
+def measure(path: Path, population: int, devices: int, repeats: int) -> dict[str, Any]:
+    """Times of `repeats` generations after the first one, which compiles."""
+    import jax
+    import jax.numpy as jnp
+
+    from rtcd_jax.analysis.scale.clock import peak_memory, timed
+    from rtcd_jax.config.load import load
+    from rtcd_jax.evaluation import make_evaluate
+    from rtcd_jax.genome import initial_genome
+    from rtcd_jax.problem import make_problem
+    from rtcd_jax.run.folder import RunFolder
+    from rtcd_jax.run.sharding import spread
+    from rtcd_jax.search import search
+    from rtcd_jax.system.cluster import Cluster
+
+    config = load(path)
+    settings = config.search.model_copy(update={"population": population, "mode": "joint"})
+    config = config.model_copy(update={"search": settings})
+    problem, cluster = make_problem(config), Cluster.of(devices)
+    chunk = min(settings.chunk, -(-population // devices))
+    spread_out, evaluations = spread(make_evaluate(problem), cluster, chunk), []
+
+    def evaluate(genomes, key):
+        found, took = timed(lambda: spread_out(genomes, key))
+        evaluations.append(took)
+        return found
+
+    plan = search.Plan(settings, config.elites, tuple(initial_genome(problem).tolist()), problem.design_dims)
+    genomes = jnp.zeros((population, len(problem.free)))
+    state = search.start(plan, jax.eval_shape(make_evaluate(problem), genomes, jax.random.key(0)))
+    steps, writes = [], []
+    with tempfile.TemporaryDirectory() as folder, RunFolder.open(Path(folder) / "run", config, cluster) as run:
+        for _ in range(repeats + 1):
+            (state, generation), step = timed(lambda state=state: search.step(plan, evaluate, state))
+            _, write = timed(lambda generation=generation: run.append(vars(generation)))
+            steps.append(step)
+            writes.append(write)
+        run.save(state, repeats)
+        _, save = timed(lambda: run.save(state, repeats + 1))
+    walls = [step.wall + write.wall for step, write in zip(steps[1:], writes[1:], strict=True)]
+    evaluated = [took.wall for took in evaluations[1:]]
+    device = jax.devices()[0]
+    memory = (device.memory_stats() or {}).get("peak_bytes_in_use")
+    return {
+        "population": population,
+        "devices": devices,
+        "kind": device.device_kind,
+        "chunk": chunk,
+        "compilation": max(0.0, steps[0].wall - statistics.median(walls)),
+        "generations": walls,
+        "evaluation": evaluated,
+        "search": [step.wall - took for step, took in zip(steps[1:], evaluated, strict=True)],
+        "lines": [write.wall for write in writes[1:]],
+        "checkpoint": save.wall,
+        "checkpoint_every": config.checkpoint.seconds,
+        "cpu": [step.cpu for step in steps[1:]],
+        "feasible": generation.feasible,
+        "peak_memory": peak_memory(),
+        "peak_device_memory": memory,
+    }
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])

@@ -1,0 +1,193 @@
+"""`rtcd scale`: a grid of points, kept as they are measured, a table and figures."""
+
+import csv
+import io
+import json
+import os
+import platform
+import statistics
+import subprocess
+import sys
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, final
+
+from rich.box import SIMPLE
+from rich.console import Console as Terminal
+from rich.table import Table
+
+from rtcd_jax.analysis.scale.figures import draw
+from rtcd_jax.config.load import Config, config_hash
+from rtcd_jax.system.console import Console
+from rtcd_jax.system.files import make_folder, plain, replace, writing
+
+POINTS, TABLE = "points.jsonl", "table.csv"
+OUT_OF_MEMORY = "out of memory"
+_MEMORY_WORDS = ("RESOURCE_EXHAUSTED", "Out of memory", "MemoryError", "bad_alloc")
+_KILLED = -9
+
+Point = Mapping[str, Any]
+
+
+@final
+@dataclass(frozen=True)
+class Progress:
+    """`done` of `total` points."""
+
+    done: int
+    total: int
+    point: str
+    elapsed: float
+
+    def __str__(self) -> str:
+        return f"point {self.done}/{self.total}: {self.point}  elapsed {self.elapsed:.0f} s"
+
+
+def study(
+    path: Path, config: Config, populations: Sequence[int], devices: Sequence[int], repeats: int, folder: Path,
+    console: Console,
+) -> None:  # fmt: skip
+    """Measures every population on every number of devices; leaves points, table and figures in the folder.
+
+    Points that are there already, of the same configuration on a machine of the same name, are not measured again. One
+    that fails says why in its row, and the others go on.
+    """
+    mark = {"config_hash": config_hash(config), "machine": platform.node(), "repeats": repeats}
+    make_folder(folder)
+    found = {_place(point): point for point in _kept(folder / POINTS, mark)}
+    grid = [(population, count) for population in sorted(set(populations)) for count in sorted(set(devices))]
+    began = time.monotonic()
+    for index, (population, count) in enumerate(grid):
+        if (population, count) not in found:
+            console.message(f"population {population}, {count} devices: a process of its own, which compiles first")
+            point = mark | {"load": os.getloadavg()[0]} | _measured(path, population, count, repeats)
+            with writing(folder / POINTS), (folder / POINTS).open("a") as file:
+                file.write(json.dumps(plain(point)) + "\n")
+            found[population, count] = point
+        summary = _sentence(found[population, count])
+        console.progress(Progress(index + 1, len(grid), summary, time.monotonic() - began))
+    rows = [row_of(found[place]) for place in grid]
+    _write_table(folder / TABLE, rows)
+    pictures = draw(rows, folder)
+    console.message(_table(rows))
+    console.message(f"{folder / TABLE}, {', '.join(path.name for path in pictures)}")
+
+
+def _kept(path: Path, mark: Point) -> Iterator[Point]:
+    if path.is_file():
+        for line in path.read_text(encoding="utf-8", errors="replace").splitlines():
+            try:
+                point = dict(json.loads(line))
+            except (TypeError, ValueError):  # torn by a kill: that point is measured again
+                continue
+            if {key: point.get(key) for key in mark} == mark and "failed" not in point:
+                yield point
+
+
+def _place(point: Point) -> tuple[int, int]:
+    return point["population"], point["devices"]
+
+
+def _measured(path: Path, population: int, devices: int, repeats: int) -> dict[str, Any]:
+    """The point, or what it failed by."""
+    words = [str(word) for word in (path, population, devices, repeats)]
+    done = subprocess.run(
+        [sys.executable, "-m", "rtcd_jax.analysis.scale.point", *words], capture_output=True, text=True, check=False
+    )
+    if done.returncode == 0:
+        return json.loads(done.stdout.splitlines()[-1])
+    told = done.stderr.strip().splitlines()
+    exhausted = done.returncode == _KILLED or any(word in done.stderr for word in _MEMORY_WORDS)
+    why = OUT_OF_MEMORY if exhausted else (told[-1] if told else f"exit code {done.returncode}")
+    return {"population": population, "devices": devices, "failed": why}
+
+
+def row_of(point: Point) -> dict[str, Any]:
+    """What the table says of a point: medians over its generations, the spread of its rate.
+
+    `overhead` is the share of a generation that is not the evaluation: CMA-ES, archive, lines, and the checkpoint,
+    which is due once in `checkpoint.seconds`.
+    """
+    row = {"population": point["population"], "devices": point["devices"], "failed": point.get("failed", "")}
+    if row["failed"]:
+        return row
+    population, walls = point["population"], point["generations"]
+    wall = statistics.median(walls)
+    checkpoint = point["checkpoint"] * min(1.0, wall / max(point["checkpoint_every"], 1e-9))
+    search, lines = (statistics.median(point[name]) for name in ("search", "lines"))
+    return row | {
+        "device": point["kind"],
+        "chunk": point["chunk"],
+        "candidates_per_s": population / wall,
+        "candidates_per_s_min": population / max(walls),
+        "candidates_per_s_max": population / min(walls),
+        "cpu_ms_per_candidate": 1e3 * statistics.median(point["cpu"]) / population,
+        "device_ms_per_candidate": 1e3 * wall * point["devices"] / population,
+        "compilation_s": point["compilation"],
+        "generation_s": wall,
+        "evaluation_s": statistics.median(point["evaluation"]),
+        "search_s": search,
+        "lines_s": lines,
+        "checkpoint_s": checkpoint,
+        "overhead": (search + lines + checkpoint) / (wall + checkpoint),
+        "feasible": point["feasible"],
+        "peak_memory_mb": point["peak_memory"] / 2**20,
+        "peak_device_memory_mb": point["peak_device_memory"] and point["peak_device_memory"] / 2**20,
+    }
+
+
+def efficiencies(rows: Sequence[Point]) -> dict[tuple[int, int], float]:
+    """Strong scaling: rate over that of the fewest devices at the same population, by the ratio of the devices."""
+    rates = {(row["population"], row["devices"]): row["candidates_per_s"] for row in rows if not row["failed"]}
+    found = {}
+    for (population, devices), rate in rates.items():
+        fewest = min(count for size, count in rates if size == population)
+        found[population, devices] = rate / rates[population, fewest] * fewest / devices
+    return found
+
+
+def _sentence(point: Point) -> str:
+    row = row_of(point)
+    head = f"population {row['population']}, {row['devices']} devices: "
+    return head + (row["failed"] or f"{row['candidates_per_s']:.4g} candidates/s")
+
+
+def _write_table(path: Path, rows: Sequence[Point]) -> None:
+    text = io.StringIO()
+    columns = dict.fromkeys(name for row in rows for name in row)
+    writer = csv.DictWriter(text, list(columns), lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows)
+    replace(path, text.getvalue().encode())
+
+
+def _table(rows: Sequence[Point]) -> str:
+    table = Table(box=SIMPLE)
+    headings = (
+        "population", "devices", "candidates/s", "min .. max", "device ms", "CPU ms", "efficiency", "overhead",
+        "compilation", "memory",
+    )  # fmt: skip
+    for heading in headings:
+        table.add_column(heading, justify="right")
+    shares = efficiencies(rows)
+    for row in rows:
+        place = row["population"], row["devices"]
+        if row["failed"]:
+            table.add_row(*map(str, place), row["failed"])
+            continue
+        table.add_row(
+            *map(str, place),
+            f"{row['candidates_per_s']:.4g}",
+            f"{row['candidates_per_s_min']:.4g} .. {row['candidates_per_s_max']:.4g}",
+            f"{row['device_ms_per_candidate']:.3g}",
+            f"{row['cpu_ms_per_candidate']:.3g}",
+            f"{shares[place]:.2f}",
+            f"{row['overhead']:.1%}",
+            f"{row['compilation_s']:.1f} s",
+            f"{row['peak_memory_mb']:.0f} MB",
+        )
+    text = io.StringIO()
+    Terminal(file=text, width=132).print(table)
+    return text.getvalue().rstrip()

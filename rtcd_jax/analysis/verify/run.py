@@ -1,0 +1,187 @@
+"""`rtcd verify`: all chunks of a run's trials on all cores; what is done is kept, so that a stopped one goes on."""
+
+import contextlib
+import functools
+import hashlib
+import io
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import as_completed
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import NamedTuple, final
+
+import numpy as np
+from rich.box import SIMPLE
+from rich.console import Console as Terminal
+from rich.table import Table
+
+from rtcd_jax.analysis.verify.verification import Trial, Verification
+from rtcd_jax.elite.closed_loop import Outcome
+from rtcd_jax.elite.elite import Elite
+from rtcd_jax.elite.records import read_elite, require_elites
+from rtcd_jax.system.console import Console
+from rtcd_jax.system.errors import UserError
+from rtcd_jax.system.files import make_folder, reading, replace, replace_json, writing
+from rtcd_jax.system.processes import processes
+
+PLACES = {"000": "elites", "initial": ""}
+"""Which funnels of a run are verified, and where in its folder they are."""
+
+
+@final
+class Job(NamedTuple):
+    """One chunk of one funnel's trial before one witness."""
+
+    run: Path
+    funnel: str
+    states: int
+    seed: int
+    witness: str
+    chunk: int
+
+
+@final
+@dataclass(frozen=True)
+class Progress:
+    """`done` of `total` chunks, `fresh` of them since the start."""
+
+    done: int
+    total: int
+    fresh: int
+    failures: int
+    elapsed: float
+
+    def __str__(self) -> str:
+        left = self.elapsed * (self.total - self.done) / self.fresh
+        return (
+            f"{self.done}/{self.total} chunks of states  {self.failures} failures"
+            f"  elapsed {self.elapsed:.0f} s  left {left:.0f} s"
+        )
+
+
+def verify_run(folder: Path, states: int, seed: int, workers: int, console: Console) -> bool:
+    """Verifies a run's best elite and its initial candidate; True if no promise was refuted.
+
+    Stores `verification/000.json` and `verification/initial.json`, and until then every finished chunk in
+    `verification/.parts`, from where the same call goes on. The workers' number changes nothing. An initial candidate
+    without a funnel is reported instead.
+
+    Raises:
+        UserError: no run folder, a run without elites, or a folder that cannot be read or written.
+    """
+    require_elites(folder)
+    parts = folder / "verification" / ".parts"
+    make_folder(parts)
+    trials = {}
+    for funnel in PLACES:
+        status = _read(folder, funnel)[1].get("status")
+        if status == "OK":
+            trials[funnel] = _trial(folder, funnel, states, seed)
+        else:
+            console.message(f"{funnel}: nothing to verify, it has no funnel ({status})")
+    jobs = [
+        Job(folder, funnel, states, seed, witness, chunk)
+        for funnel, trial in trials.items()
+        for witness in trial.names
+        for chunk in range(trial.chunks)
+    ]
+    outcomes = _outcomes(jobs, parts, workers, console)
+    verifications = {}
+    for funnel, trial in trials.items():
+        found = {(job.witness, job.chunk): seen for job, seen in outcomes.items() if job.funnel == funnel}
+        verifications[funnel] = trial.verification(found)
+        replace_json(folder / "verification" / f"{funnel}.json", verifications[funnel].record())
+    with writing(parts):
+        for part in parts.iterdir():
+            part.unlink()
+        parts.rmdir()
+    if verifications:
+        console.message(_table(verifications))
+        console.message(f"stored: {', '.join(f'{folder}/verification/{name}.json' for name in verifications)}")
+    return all(verification.kept for verification in verifications.values())
+
+
+def _read(folder: Path, funnel: str):
+    return read_elite(folder / PLACES[funnel], funnel)
+
+
+@functools.cache
+def _trial(folder: Path, funnel: str, states: int, seed: int) -> Trial:
+    return Trial(Elite.of(*_read(folder, funnel)), states, seed)
+
+
+def _outcomes(jobs: Sequence[Job], parts: Path, workers: int, console: Console) -> dict[Job, Outcome]:
+    """Of all jobs, those that are kept already read, the others done and kept."""
+    found = {job: seen for job in jobs if (seen := _kept(_part(parts, job))) is not None}
+    began, before = time.monotonic(), len(found)
+    for job, seen in _done([job for job in jobs if job not in found], workers):
+        _keep(_part(parts, job), seen)
+        found[job] = seen
+        failures = sum(int(each.failed.sum()) for each in found.values())
+        done = len(found)
+        console.progress(Progress(done, len(jobs), done - before, failures, time.monotonic() - began))
+    return {job: found[job] for job in jobs}
+
+
+def _done(jobs: Sequence[Job], workers: int) -> Iterator[tuple[Job, Outcome]]:
+    """The jobs with their outcomes, as they come; in this process if there is nothing to share out."""
+    if min(workers, len(jobs)) <= 1:
+        yield from ((job, _do(job)) for job in jobs)
+        return
+    with processes(min(workers, len(jobs))) as pool:
+        waiting = {pool.submit(_do, job): job for job in jobs}
+        for future in as_completed(waiting):
+            yield waiting[future], future.result()
+
+
+def _do(job: Job) -> Outcome:
+    return _trial(job.run, job.funnel, job.states, job.seed).outcome(job.witness, job.chunk)
+
+
+def _part(parts: Path, job: Job) -> Path:
+    """Named by all that its contents depend on."""
+    folder = job.run / PLACES[job.funnel]
+    mark = hashlib.sha256(repr(job[1:]).encode())
+    for suffix in ("npz", "json"):
+        mark.update((folder / f"{job.funnel}.{suffix}").read_bytes())
+    return parts / f"{mark.hexdigest()[:24]}.npz"
+
+
+def _keep(part: Path, outcome: Outcome) -> None:
+    file = io.BytesIO()
+    np.savez(file, **asdict(outcome))
+    replace(part, file.getvalue())
+
+
+def _kept(part: Path) -> Outcome | None:
+    """None for what is not there, or is damaged: it is made again."""
+    with contextlib.suppress(UserError), reading(part, "make it again"), np.load(part, allow_pickle=False) as stored:
+        return Outcome(**stored)
+    return None
+
+
+def _table(verifications: Mapping[str, Verification]) -> str:
+    table = Table(box=SIMPLE, title="fresh random states of the funnels (promise: sampled rung)")
+    for heading in (
+        "funnel", "witness", "states", "left funnel", "left limits", "missed goal", "failure rate", "promised", "",
+    ):  # fmt: skip
+        table.add_column(heading, justify="left" if heading in ("funnel", "witness", "") else "right")
+    for name, verification in verifications.items():
+        for witness, outcome in verification.outcomes.items():
+            states = len(verification.knots)
+            lower, upper = verification.interval(witness)
+            table.add_row(
+                name,
+                witness,
+                f"{states}",
+                f"{outcome.left_funnel.sum()}",
+                f"{outcome.left_limits.sum()}",
+                f"{outcome.missed_goal.sum()}",
+                f"{verification.failures(witness) / states:.2g} [{lower:.2g}, {upper:.2g}]",
+                f"{verification.epsilon:g} ({verification.confidence:g})",
+                "kept" if verification.keeps(witness) else "BROKEN",
+            )
+    text = io.StringIO()
+    Terminal(file=text, width=132).print(table)
+    return text.getvalue().rstrip()

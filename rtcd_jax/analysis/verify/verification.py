@@ -1,0 +1,153 @@
+"""What the witnesses saw of a funnel's fresh states, and what that says of its promise."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from typing import Any, final
+
+import numpy as np
+from jaxtyping import Float, Int
+from scipy.stats import beta
+
+from rtcd_jax.elite.closed_loop import Outcome, simulate
+from rtcd_jax.elite.elite import Elite
+from rtcd_jax.elite.simulators import witness, witnesses
+from rtcd_jax.system.errors import UserError
+
+CHUNK = 1000
+"""States simulated together: RK45 takes them as one, and all wait whenever one crosses its input limit."""
+
+
+@final
+@dataclass(frozen=True)
+class Verification:
+    """What each witness saw of the same states; `knots` says in which ellipsoid a state started."""
+
+    knots: Int[np.ndarray, " states"]
+    states: Float[np.ndarray, "states n"]
+    outcomes: Mapping[str, Outcome]
+    epsilon: float
+    confidence: float
+    seed: int
+
+    def failures(self, witness: str) -> int:
+        return int(self.outcomes[witness].failed.sum())
+
+    def interval(self, witness: str) -> tuple[float, float]:
+        """Clopper-Pearson bounds of the failure probability, each with the promise's confidence."""
+        return clopper_pearson(self.failures(witness), len(self.knots), self.confidence)
+
+    def keeps(self, witness: str) -> bool:
+        """False if the failures refute the promise: then even the lower bound exceeds epsilon."""
+        return self.interval(witness)[0] <= self.epsilon
+
+    @property
+    def kept(self) -> bool:
+        return all(map(self.keeps, self.outcomes))
+
+    @property
+    def disagreements(self) -> int:
+        """States on which the witnesses' verdicts differ."""
+        failed = np.stack([outcome.failed for outcome in self.outcomes.values()])
+        return int(np.sum(failed.any(axis=0) & ~failed.all(axis=0)))
+
+    def record(self) -> dict[str, Any]:
+        """As JSON stores it."""
+        return {
+            "states": len(self.knots),
+            "seed": self.seed,
+            "epsilon": self.epsilon,
+            "confidence": self.confidence,
+            "kept": self.kept,
+            "disagreements": self.disagreements,
+            "witnesses": {witness: self._record_of(witness) for witness in self.outcomes},
+        }
+
+    def _record_of(self, witness: str) -> dict[str, Any]:
+        outcome = self.outcomes[witness]
+        lower, upper = self.interval(witness)
+        return {
+            "left_funnel": outcome.left_funnel.sum(),
+            "left_limits": outcome.left_limits.sum(),
+            "missed_goal": outcome.missed_goal.sum(),
+            "failures": self.failures(witness),
+            "rate": self.failures(witness) / len(self.knots),
+            "rate_lower": lower,
+            "rate_upper": upper,
+            "kept": self.keeps(witness),
+            "failures_per_knot": np.bincount(self.knots[outcome.failed], minlength=self.knots[-1] + 1),
+        }
+
+
+def clopper_pearson(failures: int, trials: int, confidence: float) -> tuple[float, float]:
+    """Exact lower and upper bounds of a probability, each of which holds with `confidence` (one-sided)."""
+    lower = beta.ppf(1 - confidence, failures, trials - failures + 1) if failures else 0.0
+    upper = beta.ppf(confidence, failures + 1, trials - failures) if failures < trials else 1.0
+    return float(lower), float(upper)
+
+
+@final
+@dataclass(frozen=True)
+class Trial:
+    """A funnel, the fresh states that it is tried with, and how these are cut into chunks.
+
+    Every chunk has states of every knot, and is the same whoever simulates it, and when.
+
+    Raises:
+        UserError: fewer states than knots.
+    """
+
+    elite: Elite
+    states: int
+    seed: int
+
+    def __post_init__(self):
+        if self.states < len(self.elite.time):
+            knots = len(self.elite.time)
+            raise UserError(f"states = {self.states}: must be at least {knots}, one for each knot's ellipsoid")
+
+    @property
+    def chunks(self) -> int:
+        return -(-self.states // CHUNK)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Of the witnesses."""
+        return tuple(found.name for found in witnesses(self.elite, 2))
+
+    def sample(self) -> tuple[Int[np.ndarray, " states"], Float[np.ndarray, "states n"]]:
+        """Knots, ascending, and uniform states of their ellipsoids."""
+        return self.elite.sample(self.states, np.random.default_rng(self.seed))
+
+    def outcome(self, name: str, chunk: int) -> Outcome:
+        """What one witness sees of one chunk.
+
+        Raises:
+            UserError: a goal that its own LQR does not hold.
+        """
+        knots, x = (drawn[chunk :: self.chunks] for drawn in self.sample())
+        seen = witness(self.elite, name, len(x))
+        return simulate(self.elite, seen.dynamics, seen.march, knots, x, seen.settle)
+
+    def verification(self, outcomes: Mapping[tuple[str, int], Outcome]) -> Verification:
+        """All chunks' outcomes, by witness and chunk, put together."""
+        merged = {name: self._merged(name, outcomes) for name in dict.fromkeys(name for name, _ in outcomes)}
+        return Verification(*self.sample(), merged, self.elite.epsilon, self.elite.confidence, self.seed)
+
+    def _merged(self, name: str, outcomes: Mapping[tuple[str, int], Outcome]) -> Outcome:
+        whole = {field.name: np.zeros(self.states, bool) for field in fields(Outcome)}
+        for field, seen in whole.items():
+            for chunk in range(self.chunks):
+                seen[chunk :: self.chunks] = getattr(outcomes[name, chunk], field)
+        return Outcome(**whole)
+
+
+def verify_funnel(elite: Elite, states: int = 1000, seed: int = 0) -> Verification:
+    """Puts `states` fresh states of the funnel before every witness that knows the plant, in this process.
+
+    Raises:
+        UserError: fewer states than knots, or a goal that its own LQR does not hold.
+        ValueError: an unknown plant.
+    """
+    trial = Trial(elite, states, seed)
+    pairs = [(name, chunk) for name in trial.names for chunk in range(trial.chunks)]
+    return trial.verification({pair: trial.outcome(*pair) for pair in pairs})

@@ -1,0 +1,185 @@
+"""`rtcd falsify`: does any of a great many simulated motions break what a certificate says?
+
+A proof that is right is not falsified; a prover, a checker and a model that share a mistake would be.
+"""
+
+import hashlib
+import time
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple, final
+
+import numpy as np
+
+from rtcd_jax.certificate.falsify.simulation import REPEATED, Motions, Seen
+from rtcd_jax.system.console import Console
+from rtcd_jax.system.journal import Journal
+from rtcd_jax.system.processes import processes
+
+CHUNK = 16384
+"""Motions simulated together: their states stay in the processor's cache."""
+PILOT = 512
+FEWEST, MOST = 4, 128
+"""Steps an interval, doubled until the integrator's error is small."""
+TOLERANCE = 1e-5
+"""In |y|, of the pilot's motions."""
+ROUNDING = 1e-12
+
+
+class Found(NamedTuple):
+    """Counts of motions, by what they broke, and the extremes of all.
+
+    `allowance` is what |y| may exceed 1 by: twice the largest difference that halved steps made, and rounding.
+    """
+
+    rollouts: int
+    steps: int
+    left_funnel: int
+    left_limits: int
+    moved_away: int
+    not_arrived: int
+    level: float
+    share_of_limit: float
+    error: float
+    allowance: float
+
+    @property
+    def broken(self) -> int:
+        """How often the certificate was broken."""
+        return self.left_funnel + self.left_limits + self.moved_away + self.not_arrived
+
+
+@final
+@dataclass(frozen=True)
+class Progress:
+    """`done` of `total` motions, `before` of them by an earlier call."""
+
+    done: int
+    total: int
+    level: float
+    elapsed: float
+    before: int
+
+    def __str__(self) -> str:
+        left = self.elapsed * (self.total - self.done) / (self.done - self.before)
+        return (
+            f"{self.done}/{self.total} motions  largest |y| {self.level:.9f}"
+            f"  elapsed {self.elapsed:.0f} s  left {left:.0f} s"
+        )
+
+
+class Part(NamedTuple):
+    """Of some motions: how many, the extremes, and what is beyond 1 or, in the goal region, grows."""
+
+    rollouts: int
+    level: float
+    share_of_limit: float
+    error: float
+    levels: list[float]
+    shares: list[float]
+    growths: list[float]
+    not_arrived: int
+
+    @classmethod
+    def of(cls, seen: Seen) -> "Part":
+        level, share, growth = seen.level, seen.share_of_limit, seen.growth
+        levels, shares, growths = level[~(level <= 1)], share[~(share <= 1)], growth[~(growth <= 0)]
+        return cls(
+            len(level), float(level.max()), float(share.max()), float(seen.error),
+            levels.tolist(), shares.tolist(), growths.tolist(), int(np.sum(~seen.arrived)),
+        )  # fmt: skip
+
+
+def falsify_file(path: Path, rollouts: int, seed: int, workers: int, console: Console) -> bool:
+    """Simulates `rollouts` motions of a certificate; True if none broke it. The workers' number changes nothing.
+
+    What was finished before a kill is kept beside the certificate, and is not done again.
+
+    Raises:
+        UserError: no certificate, or a folder that cannot be written.
+    """
+    motions = Motions.of(path)
+    digest = hashlib.sha256(path.read_bytes()).hexdigest()
+    head = {"certificate": digest, "rollouts": rollouts, "seed": seed, "chunk": CHUNK}
+    journal = Journal(path.with_name(f".{path.stem}.falsify.jsonl"), head)
+    steps = enough_steps(motions, seed)
+    began, kept = time.monotonic(), len(journal.lines)
+    parts = [Part(**line) for line in journal.lines]
+    for part in _parts(path, rollouts, seed, steps, workers, kept):
+        journal.append(part._asdict())
+        parts.append(part)
+        done, before = sum(each.rollouts for each in parts), sum(each.rollouts for each in parts[:kept])
+        level = max(each.level for each in parts)
+        console.progress(Progress(done, rollouts, level, time.monotonic() - began, before))
+    journal.close()
+    found = summed(parts, steps)
+    console.message(sentence(motions, found))
+    return found.broken == 0
+
+
+def enough_steps(motions: Motions, seed: int) -> int:
+    """Steps an interval with which halved steps change a few hundred motions' |y| by `TOLERANCE` at most."""
+    steps = FEWEST
+    while steps < MOST and motions.follow(PILOT, steps, np.random.default_rng(seed)).error > TOLERANCE:
+        steps *= 2
+    return steps
+
+
+def _parts(path: Path, rollouts: int, seed: int, steps: int, workers: int, kept: int) -> Iterator[Part]:
+    """The parts in their order, from the first one that is not kept."""
+    sizes = [min(CHUNK, rollouts - start) for start in range(0, rollouts, CHUNK)][kept:]
+    if not sizes:
+        return
+    with processes(min(workers, len(sizes)), _remember, path) as pool:
+        seeds = [(seed, kept + i) for i in range(len(sizes))]
+        yield from pool.map(_work, sizes, seeds, [steps] * len(sizes))
+
+
+_motions: Motions
+
+
+def _remember(path: Path) -> None:
+    """In a worker: the certificate."""
+    global _motions
+    _motions = Motions.of(path)
+
+
+def _work(count: int, seed: tuple[int, int], steps: int) -> Part:
+    return Part.of(_motions.follow(count, steps, np.random.default_rng(seed)))
+
+
+def summed(parts: list[Part], steps: int) -> Found:
+    """All parts together."""
+    error = max(each.error for each in parts)
+    allowance = 2 * error + ROUNDING
+
+    def beyond(values: Iterable[list[float]], bound: float) -> int:
+        return sum(not value <= bound + allowance for each in values for value in each)
+
+    return Found(
+        rollouts=sum(each.rollouts for each in parts),
+        steps=steps,
+        left_funnel=beyond((each.levels for each in parts), 1),
+        left_limits=beyond((each.shares for each in parts), 1),
+        moved_away=beyond((each.growths for each in parts), 0),
+        not_arrived=sum(each.not_arrived for each in parts),
+        level=max(each.level for each in parts),
+        share_of_limit=max(each.share_of_limit for each in parts),
+        error=error,
+        allowance=allowance,
+    )
+
+
+def sentence(motions: Motions, found: Found) -> str:
+    """What was seen, in plain words."""
+    nearest = f"closest {found.share_of_limit:.6f} of it" if found.share_of_limit else "there is none"
+    return (
+        f"{found.rollouts} simulated motions of the {motions.plant} from instants all over [{motions.start:.6g} s, "
+        f"{motions.end:.6g} s], half of them from the funnel's boundary: {found.left_funnel} left the funnel (largest "
+        f"|y| after the start {found.level:.9f}), {found.left_limits} exceeded a limit on the states "
+        f"({nearest}), {found.moved_away} moved away from the goal in the goal region, "
+        f"{found.not_arrived} did not arrive. Integrator: {found.steps} classical Runge-Kutta steps an interval; "
+        f"halved steps change |y| of every {REPEATED}th motion by {found.error:.2g} at most; beyond 1 counts from "
+        f"{found.allowance:.2g} on."
+    )

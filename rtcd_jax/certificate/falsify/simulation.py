@@ -1,0 +1,224 @@
+"""The motions that a certificate speaks of, simulated: its claim and its ellipsoids alone, nothing of the prover.
+
+The equations are those of `rtcd_jax.analysis.verify`, written apart from the checker's and the plants'. Every motion is
+integrated by classical Runge-Kutta steps; every `REPEATED`-th one a second time with halved steps, and the largest
+difference of the two in |y| is the measure of the integrator's error. The loop is Lipschitz, with kinks where the
+input meets its limit, so the order is two at least and that difference is 3/4 of the error or more.
+"""
+
+import itertools
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple, final
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from rtcd_jax.certificate import check
+from rtcd_jax.certificate.check import Node, Refused
+from rtcd_jax.elite.simulators import CLOSED_FORMS
+from rtcd_jax.system.errors import UserError
+
+REPEATED = 16
+ARRIVED = 0.1
+"""|y| in the goal region at which a motion is followed no further: the proof holds all the way down."""
+LONGEST = 60.0
+"""Time [s] after which a motion has not arrived."""
+COARSER = 4
+"""Steps in the goal region are so many times longer: there |y| falls fast, and its growth alone is judged."""
+TOGETHER = 0.2
+"""Time [s] between two looks for motions that have arrived."""
+
+Input = Callable[[float, np.ndarray], np.ndarray]
+"""Time [s], states [n M] -> u [M]."""
+
+
+class Ellipsoids(NamedTuple):
+    """One interval: its knot, its ends as shares of the knots' interval, and L at its ends with its bend."""
+
+    knot: int
+    start: float
+    end: float
+    first: np.ndarray
+    last: np.ndarray
+    bend: np.ndarray
+
+    def axes(self, share: float) -> np.ndarray:
+        """L [n n] at a share of the knots' interval."""
+        s = (2 * share - self.start - self.end) / (self.end - self.start)
+        return (self.first * (1 - s) + self.last * (1 + s)) / 2 + (1 - s * s) * (self.bend[0] + s * self.bend[1])
+
+
+class Seen(NamedTuple):
+    """Of every motion, after its start: the largest |y| in the funnel, the largest share of a limit, the largest
+    growth of |y| in one step in the goal region, whether it arrived; of all, the integrator's error in |y|."""
+
+    level: Float[np.ndarray, " M"]
+    share_of_limit: Float[np.ndarray, " M"]
+    growth: Float[np.ndarray, " M"]
+    arrived: Bool[np.ndarray, " M"]
+    error: float
+
+
+@final
+class Motions:
+    """What a certificate's file claims, in floats."""
+
+    def __init__(self, content: Any):
+        claim = check.read_claim(Node("claim", content["claim"]))
+        pieces = [check.read_stretch(Node(f"funnel[{i}]", each), claim) for i, each in enumerate(content["funnel"])]
+        name = content["claim"]["plant"]
+        self.plant, self.n, self.dt, self.limit = name, claim.n, float(claim.dt), float(claim.limit)
+        self._rate = CLOSED_FORMS[name]({key: float(value) for key, value in claim.parameters.items()})
+        self._x, self._rates, self._u, self._gains = map(_floats, (claim.x, claim.rates, claim.u, claim.K))
+        self._goal, self._goal_gain = _floats(claim.x_goal), _floats(claim.K_goal)
+        self._bounds = np.array([np.inf if b is None else float(b) for b in claim.bounds])
+        self._outward = np.linalg.inv(_floats(Node("goal.axes", content["goal"]["axes"]).array(self.n, self.n)))
+        self.pieces = [
+            Ellipsoids(p.knot, float(p.start), float(p.end), *map(_floats, (p.first, p.last, p.bend))) for p in pieces
+        ]
+        self.start = (self.pieces[0].knot + self.pieces[0].start) * self.dt
+        self.end = len(self._u) * self.dt
+
+    @classmethod
+    def of(cls, path: Path) -> "Motions":
+        """Of a certificate's file.
+
+        Raises:
+            UserError: the file cannot be read, or is no certificate.
+        """
+        try:
+            return cls(check.parse(path.read_text("ascii")))
+        except OSError as error:
+            raise UserError(f"{path}: {error.strerror}") from None
+        except (Refused, UnicodeDecodeError, KeyError, TypeError) as error:
+            raise UserError(f"{path} is no certificate ({error}): `rtcd check` says more") from None
+
+    def follow(self, count: int, steps: int, random: np.random.Generator) -> Seen:
+        """`count` motions to the goal, by `steps` steps an interval.
+
+        They start in every interval in proportion to its length, at an instant of it drawn at random, every other one
+        on the boundary, the others uniform inside.
+        """
+        lengths = np.cumsum([p.end - p.start for p in self.pieces])
+        places = np.searchsorted(lengths / lengths[-1], (np.arange(count) + 0.5) / count)
+        y, x = _ball(self.n, count, random), np.empty((self.n, count))
+        flight = _Flight(self._bounds, x, x[:, ::REPEATED].copy())
+        for place, piece in enumerate(self.pieces):
+            before, after = np.searchsorted(places, (place, place + 1))
+            share = random.uniform(piece.start, piece.end)
+            x[:, before:after] = self._nominal(piece.knot, share)[:, None] + piece.axes(share) @ y[:, before:after]
+            flight.again[:] = np.where(np.arange(0, count, REPEATED) >= before, x[:, ::REPEATED], flight.again)
+            self._through(piece, piece.start, flight, slice(0, before), steps)
+            self._through(piece, share, flight, slice(before, after), steps)
+        arrived, growth = self._settle(flight, steps)
+        return Seen(flight.level, flight.share_of_limit, growth, arrived, flight.error)
+
+    def _through(self, piece: Ellipsoids, start: float, flight: "_Flight", who: slice, steps: int) -> None:
+        """Carries some motions from a share of the interval to its end."""
+        if who.start == who.stop:
+            return
+        again = slice(-(-who.start // REPEATED), -(-who.stop // REPEATED))
+        shares = np.linspace(start, piece.end, steps + 1)
+        step = (shares[1] - shares[0]) * self.dt
+        law = self._tracking(piece.knot)
+        for share, ahead in itertools.pairwise(shares):
+            t = share * self.dt
+            flight.x[:, who] = self._steps(law, t, step, flight.x[:, who], 1)
+            flight.again[:, again] = self._steps(law, t, step, flight.again[:, again], 2)
+            inward = np.linalg.inv(piece.axes(ahead))
+            flight.look(self._nominal(piece.knot, ahead), inward, who, again)
+
+    def _settle(self, flight: "_Flight", steps: int) -> tuple[np.ndarray, np.ndarray]:
+        """Whether every motion arrives, and the largest growth of |y| in one step."""
+        count, step = flight.x.shape[1], COARSER * self.dt / steps
+        arrived, growth = np.zeros(count, bool), np.zeros(count)
+        moving = np.arange(count)
+        for _ in range(round(LONGEST / TOGETHER)):
+            x, level = flight.x[:, moving], self._goal_level(flight.x[:, moving])
+            for i in range(round(TOGETHER / step)):
+                x = self._steps(self._holding, i * step, step, x, 1)
+                now = self._goal_level(x)
+                growth[moving] = np.maximum(growth[moving], now - level)
+                level = now
+                flight.mind_limits(x, moving)
+            flight.x[:, moving] = x
+            arrived[moving[level <= ARRIVED]] = True
+            moving = moving[level > ARRIVED]
+            if not moving.size:
+                break
+        return arrived, growth
+
+    def _goal_level(self, x: np.ndarray) -> np.ndarray:
+        return np.linalg.norm(self._outward @ (x - self._goal[:, None]), axis=0)
+
+    def _nominal(self, k: int, t: float) -> np.ndarray:
+        """x* at a share of an interval: the cubic Hermite interpolant."""
+        a, b, va, vb = self._x[k], self._x[k + 1], self._rates[k][0] * self.dt, self._rates[k][1] * self.dt
+        return a + t * (va + t * (3 * (b - a) - 2 * va - vb + t * (2 * (a - b) + va + vb)))
+
+    def _tracking(self, k: int) -> Input:
+        def u(t: float, x: np.ndarray) -> np.ndarray:
+            share = t / self.dt
+            gain = self._gains[k] + share * (self._gains[k + 1] - self._gains[k])
+            return self._u[k] - gain @ (x - self._nominal(k, share)[:, None])
+
+        return u
+
+    def _holding(self, _: float, x: np.ndarray) -> np.ndarray:
+        return -self._goal_gain @ (x - self._goal[:, None])
+
+    def _slope(self, law: Input, t: float, x: np.ndarray) -> np.ndarray:
+        u = np.clip(law(t, x), -self.limit, self.limit)
+        return np.ascontiguousarray(self._rate(x.T, u[:, None]).T)
+
+    def _steps(self, law: Input, t: float, step: float, x: np.ndarray, parts: int) -> np.ndarray:
+        """The states after one step, taken in `parts` classical Runge-Kutta steps."""
+        h = step / parts
+        for part in range(parts):
+            now = t + part * h
+            a = self._slope(law, now, x)
+            b = self._slope(law, now + h / 2, x + h / 2 * a)
+            c = self._slope(law, now + h / 2, x + h / 2 * b)
+            d = self._slope(law, now + h, x + h * c)
+            x = x + h / 6 * (a + 2 * (b + c) + d)
+        return x
+
+
+class _Flight:
+    """Motions under way: their states [n M], every `REPEATED`-th by halved steps, and what was seen of them."""
+
+    def __init__(self, bounds: np.ndarray, x: np.ndarray, again: np.ndarray):
+        self.x, self.again, self.error = x, again, 0.0
+        self.level, self.share_of_limit = np.zeros(x.shape[1]), np.zeros(x.shape[1])
+        self._limited = np.isfinite(bounds)
+        self._bounds = bounds[self._limited, None]
+
+    def look(self, center: np.ndarray, inward: np.ndarray, who: slice, again: slice) -> None:
+        """|y| at an instant of the funnel; `inward` is L^-1."""
+        level = np.linalg.norm(inward @ (self.x[:, who] - center[:, None]), axis=0)
+        finer = np.linalg.norm(inward @ (self.again[:, again] - center[:, None]), axis=0)
+        self.level[who] = np.maximum(self.level[who], level)
+        self.mind_limits(self.x[:, who], who)
+        if finer.size:
+            self.error = max(self.error, float(np.max(np.abs(level[-who.start % REPEATED :: REPEATED] - finer))))
+
+    def mind_limits(self, x: np.ndarray, who: Any) -> None:
+        if self._limited.any():
+            share = np.max(np.abs(x[self._limited]) / self._bounds, axis=0)
+            self.share_of_limit[who] = np.maximum(self.share_of_limit[who], share)
+
+
+def _ball(n: int, count: int, random: np.random.Generator) -> np.ndarray:
+    """Points [n M] of the unit ball, every other one on its boundary, the others uniform inside."""
+    y = random.normal(size=(n, count))
+    radius = random.uniform(size=count) ** (1 / n)
+    radius[::2] = 1
+    return radius * y / np.linalg.norm(y, axis=0)
+
+
+def _floats(values: Any) -> np.ndarray:
+    """Nested lists of exact numbers."""
+    if not isinstance(values, list | tuple):
+        return np.asarray(float(values))
+    return np.array([_floats(v) for v in values])

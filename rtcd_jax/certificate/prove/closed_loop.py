@@ -1,0 +1,232 @@
+"""An elite as a certificate sees it: the claim of its closed loop, and the same loop in float64 to search with."""
+
+from collections.abc import Callable, Mapping
+from copy import copy
+from typing import Any, final
+
+import numpy as np
+
+from rtcd_jax.certificate import check
+from rtcd_jax.system.errors import UserError
+
+CLIMBERS, TRIES = 8, 40
+CLIMBS = (0.2, 0.1, 0.05, 0.02)
+"""Best directions of a sphere that are improved by so many random steps of these lengths."""
+
+
+def double(value: float) -> str:
+    """A double as certificates write it."""
+    return float(value).hex()
+
+
+def doubles(values: Any) -> Any:
+    """Nested lists of doubles."""
+    return [doubles(v) for v in values] if np.ndim(values) else double(values)
+
+
+def sealed(record: Mapping[str, Any]) -> dict[str, Any]:
+    """The record and the digests of its values."""
+    return {**record, "sha256": {name: check.seal(value) for name, value in record.items()}}
+
+
+def claim_of(arrays: Mapping[str, np.ndarray], record: Mapping[str, Any]) -> dict[str, Any]:
+    """The claim about a stored elite, without `start`: what is to be proved is written down before the proof.
+
+    The rates of the cubic Hermite interpolant are f(x_k, u_k) and f(x_{k+1}, u_k), rounded to doubles.
+
+    Raises:
+        UserError: a plant that the checker does not know, or more than one input.
+    """
+    name = record["plant"]
+    if name not in check.PLANTS:
+        raise UserError(f"no certificate for the plant {name!r}: the checker knows {', '.join(check.PLANTS)}")
+    plant, x, u = check.PLANTS[name], arrays["x"], arrays["u"]
+    if u.shape[1] != 1:
+        raise UserError(f"no certificate for {u.shape[1]} inputs: the checker knows loops with one")
+    parameters = {key: float(record["parameters"][key]) for key in plant.parameters}
+    if float(arrays["u_max"][0]) != parameters[plant.limit]:
+        raise UserError(f"u_max = {arrays['u_max'][0]}: must be {plant.limit} = {parameters[plant.limit]}")
+    ends = np.stack([x[:-1], x[1:]])
+    rates = np.moveaxis(rate(plant, parameters, np.moveaxis(ends, 2, 0), u[:, 0]), 0, 2)
+    return {
+        "plant": name,
+        "parameters": {key: double(value) for key, value in parameters.items()},
+        "state_limits": [None if limit is None else double(limit) for limit in record["state_limits"]],
+        "dt": double(arrays["time"][1] - arrays["time"][0]),
+        "x": doubles(x),
+        "rates": doubles(np.swapaxes(rates, 0, 1)),
+        "u": doubles(u[:, 0]),
+        "K": doubles(arrays["K"][:, 0]),
+        "x_goal": doubles(arrays["x_goal"]),
+        "K_goal": doubles(arrays["K_goal"][0]),
+    }
+
+
+def rate(plant: check.Plant, parameters: Mapping[str, float], x: np.ndarray, u: Any) -> np.ndarray:
+    """x' [n ...] of states [n ...], real or complex."""
+    angle = x[plant.angle]
+    determinant, drift, push = plant.field(parameters, x, np.sin(angle), np.cos(angle))
+    return np.stack([(a + b * u) / determinant for a, b in zip(drift, push, strict=True)])
+
+
+def linear(
+    plant: check.Plant, parameters: Mapping[str, float], x: np.ndarray, u: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """A [n n] and B [n] at x [n], by complex steps."""
+    step = 1e-30
+    a = np.imag(rate(plant, parameters, x[:, None] + 1j * step * np.eye(len(x)), u)) / step
+    return a, np.imag(rate(plant, parameters, x.astype(complex), u + 1j * step)) / step
+
+
+@final
+class Loop:
+    """The claimed loop in float64, and the value function that shapes its funnel.
+
+    Between knots S is the cubic Hermite interpolant of S_k with the slopes of the policy's Riccati equation, unless
+    it is `shaped` anew.
+    """
+
+    def __init__(self, claim: check.Claim, arrays: Mapping[str, np.ndarray], policy: Mapping[str, float] | None = None):
+        def floats(values: Any) -> Any:
+            return np.array(_floats(values))
+
+        self.claim = claim
+        self.plant, self.n = claim.plant, claim.n
+        self.parameters = {key: float(value) for key, value in claim.parameters.items()}
+        self.limit, self.dt = float(claim.limit), float(claim.dt)
+        self.x, self.rates, self.u = floats(claim.x), floats(claim.rates), floats(claim.u)
+        self.gains, self.goal, self.goal_gain = floats(claim.K), floats(claim.x_goal), floats(claim.K_goal)
+        self.bounds = np.array([np.inf if b is None else float(b) for b in claim.bounds])
+        self.values = np.asarray(arrays["S"])
+        told = policy or {}
+        q, r = np.asarray(arrays["Q"]), told.get("input_weight", 1.0) * float(arrays["R"][0, 0])
+        left = np.maximum(1 - np.abs(self.u) / self.limit, told.get("authority", 1.0))
+        shift = told.get("discount", 0.0) * np.eye(self.n)
+        self.slopes = np.zeros((len(self.u), 2, self.n, self.n))
+        for k, u in enumerate(self.u):
+            for end in (0, 1):
+                a, b = linear(self.plant, self.parameters, self.x[k + end], u)
+                self.slopes[k, end] = riccati(self.values[k + end], a + shift, b, q, left[k] ** 2 / r)
+
+    def rate(self, x: np.ndarray, u: Any) -> np.ndarray:
+        return rate(self.plant, self.parameters, x, u)
+
+    def shaped(self, values: np.ndarray, slopes: np.ndarray) -> "Loop":
+        """The same loop with another V: S at the knots [N+1 n n] and S' at both ends of the intervals [N 2 n n]."""
+        other = copy(self)
+        other.values, other.slopes = values, slopes
+        return other
+
+    def nominal(self, k: int, share: float) -> tuple[np.ndarray, np.ndarray]:
+        """x* and x*' at a share of the interval k."""
+        return hermite(share, self.dt, self.x[k], self.rates[k, 0], self.x[k + 1], self.rates[k, 1])
+
+    def value(self, k: int, share: float) -> tuple[np.ndarray, np.ndarray]:
+        """S and S'."""
+        return hermite(share, self.dt, self.values[k], self.slopes[k, 0], self.values[k + 1], self.slopes[k, 1])
+
+    def axes(self, k: int, share: float, rho: float, growth: float) -> tuple[np.ndarray, np.ndarray]:
+        """L with L L' = rho S^-1 and its rate, where rho' = growth rho; the angle's row has its first entry alone.
+
+        Raises:
+            Refused: between knots, S is not positive definite.
+        """
+        s, slope = self.value(k, share)
+        check.insist(float(np.linalg.eigvalsh(s)[0]) > 0, f"interval {k}", "S is not positive definite between knots")
+        p = np.linalg.inv(s) * rho
+        p_rate = growth * p - p @ slope @ p / rho
+        order = [self.plant.angle, *(i for i in range(self.n) if i != self.plant.angle)]
+        c = np.linalg.cholesky(p[np.ix_(order, order)])
+        inner = np.linalg.solve(c, np.linalg.solve(c, p_rate[np.ix_(order, order)]).T)
+        c_rate = c @ (np.tril(inner, -1) + np.diag(np.diag(inner)) / 2)
+        back, sign = np.argsort(order), np.ones(self.n)
+        sign[-1] = np.linalg.det(np.eye(self.n)[order])  # of the permutation: det L > 0
+        return c[back] * sign, c_rate[back] * sign
+
+    def growth(self, k: int, share: float, rho: float, directions: np.ndarray) -> float:
+        """The largest V' / V over the surface V = rho, looked for from the sampled directions [n D]."""
+        s, slope = self.value(k, share)
+        axes, _ = self.axes(k, share, rho, 0.0)
+        center, center_rate = self.nominal(k, share)
+        gain = (1 - share) * self.gains[k] + share * self.gains[k + 1]
+
+        def rises(y: np.ndarray) -> np.ndarray:
+            error = axes @ y
+            u = np.clip(self.u[k] - gain @ error, -self.limit, self.limit)
+            fall = self.rate(center[:, None] + error, u) - center_rate[:, None]
+            return np.sum((s @ error) * (2 * fall) + error * (slope @ error), axis=0) / rho
+
+        return _highest(rises, directions)
+
+    def drift(self, k: int, share: float, axes: np.ndarray, y: np.ndarray) -> np.ndarray:
+        """y'L^-1 (f(x* + L y, u) - x*') [D] for directions y [n D] of an ellipsoid L."""
+        center, center_rate = self.nominal(k, share)
+        gain = (1 - share) * self.gains[k] + share * self.gains[k + 1]
+        error = axes @ y
+        u = np.clip(self.u[k] - gain @ error, -self.limit, self.limit)
+        fall = self.rate(center[:, None] + error, u) - center_rate[:, None]
+        return np.sum(y * np.linalg.solve(axes, fall), axis=0)
+
+    def rooms(self, k: int, share: float) -> np.ndarray:
+        """The half widths [n] that the limits on the states leave to an ellipsoid."""
+        center, _ = self.nominal(k, share)
+        return self.bounds - np.abs(center)
+
+    def box_level(self, k: int, share: float) -> float:
+        """The level of the ellipsoid that touches a limit on the states."""
+        return _touching(self.rooms(k, share), self.value(k, share)[0])
+
+    def goal_box_level(self) -> float:
+        """As `box_level`; half a turn away is another equilibrium, which no goal region has in it."""
+        rooms = self.bounds - np.abs(self.goal)
+        rooms[self.plant.angle] = min(rooms[self.plant.angle], np.pi)
+        return _touching(rooms, self.values[-1])
+
+    def goal_growth(self, rho: float, directions: np.ndarray) -> float:
+        """As `growth`, about the goal."""
+        s = self.values[-1]
+        axes = np.linalg.cholesky(np.linalg.inv(s) * rho)
+
+        def rises(y: np.ndarray) -> np.ndarray:
+            error = axes @ y
+            u = np.clip(-self.goal_gain @ error, -self.limit, self.limit)
+            return 2 * np.sum((s @ error) * self.rate(self.goal[:, None] + error, u), axis=0) / rho
+
+        return _highest(rises, directions)
+
+
+def _touching(rooms: np.ndarray, s: np.ndarray) -> float:
+    """The level of V = x'S x whose ellipsoid is as wide as the first of the rooms that it fills."""
+    return float(np.min(rooms**2 / np.diag(np.linalg.inv(s))))
+
+
+def _highest(f: Callable[[np.ndarray], np.ndarray], directions: np.ndarray) -> float:
+    """The largest f over the sphere: the best directions [n D], then random steps around them, ever shorter."""
+    values = f(directions)
+    if len(directions) == 2:  # a circle is covered densely
+        return float(values.max())
+    random, best = np.random.default_rng(0), directions[:, np.argsort(values)[-CLIMBERS:]]
+    for reach in CLIMBS:
+        tries = best[:, :, None] + reach * random.normal(size=(*best.shape, TRIES))
+        tries = np.concatenate([best[:, :, None], tries], axis=2)
+        tries /= np.linalg.norm(tries, axis=0)
+        values = f(tries.reshape(len(best), -1)).reshape(best.shape[1], -1)
+        best = np.take_along_axis(tries, values.argmax(axis=1)[None, :, None], axis=2)[:, :, 0]
+    return float(values.max())
+
+
+def _floats(values: Any) -> Any:
+    return [_floats(v) for v in values] if isinstance(values, list | tuple) else float(values)
+
+
+def hermite(share: float, dt: float, a: Any, a_rate: Any, b: Any, b_rate: Any) -> tuple[Any, Any]:
+    """Value and rate of the cubic with these values and rates at the ends of an interval of `dt`."""
+    t, rest = share, 1 - share
+    value = rest * rest * ((1 + 2 * t) * a + t * dt * a_rate) + t * t * ((3 - 2 * t) * b - rest * dt * b_rate)
+    slope = 6 * t * rest * (b - a) / dt + rest * (1 - 3 * t) * a_rate + t * (3 * t - 2) * b_rate
+    return value, slope
+
+
+def riccati(s: np.ndarray, a: np.ndarray, b: np.ndarray, q: np.ndarray, r_inverse: float) -> np.ndarray:
+    """S' = -(A'S + S A - S B R^-1 B'S + Q)."""
+    return -(a.T @ s + s @ a - r_inverse * np.outer(s @ b, s @ b) + q)

@@ -1,0 +1,69 @@
+"""The goal region: the largest provable level of V about the goal under its own saturated LQR, for all time."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from rtcd_jax.certificate import check
+from rtcd_jax.certificate.check import Claim, Q, Refused, Shell
+from rtcd_jax.certificate.prove.backward import on_grid, prove
+from rtcd_jax.certificate.prove.closed_loop import Loop
+from rtcd_jax.certificate.prove.levels import directions, goal_level
+
+LADDER = (1.0, 0.995, 0.985, 0.97, 0.95, 0.92, 0.88, 0.83, 0.77, 0.7, 0.6, 0.5, 0.35, 0.2, 0.1)
+"""Shares of the level that the samples allow, in the order of trial."""
+ROOM = 1e-3
+"""Share of the level by which the funnel's outlet is smaller than the goal region."""
+ORDERS = {2: 9, 4: 5}
+"""By the number of states: order of Taylor models; the monomials have half the degree, rounded up."""
+NARROWEST = 1 / 64
+"""Narrowest shell of levels."""
+
+
+class GoalRegion(NamedTuple):
+    """{V <= rho} as proved, shell by shell; the funnel's outlet has the level `outlet`."""
+
+    rho: float
+    outlet: float
+    axes: list
+    order: int
+    shells: list[Shell]
+    margin: float
+
+
+def goal_region(claim: Claim, loop: Loop, exact: bool) -> GoalRegion | None:
+    """The first level of the ladder that goes through; None if none does."""
+    aims = directions(claim.n)
+    try:
+        most = goal_level(loop, aims)
+    except Refused:
+        return None
+    for share in LADDER:
+        found = _at_level(claim, loop, share * most, exact, aims)
+        if found is not None:
+            return found
+    return None
+
+
+def _at_level(claim: Claim, loop: Loop, rho: float, exact: bool, aims: np.ndarray) -> GoalRegion | None:
+    last, order = len(loop.u) - 1, ORDERS[claim.n]
+    axes = on_grid(loop.axes(last, 1.0, rho, 0.0)[0])
+    degree, waiting, shells, least = (order + 2) // 2, [(0.0, 1.0)], [], np.inf
+    try:
+        field = check.goal_field(claim, axes, order, "goal")
+        while waiting:
+            start, end = waiting.pop()
+            share = Q(*start.as_integer_ratio()), Q(*end.as_integer_ratio())
+            todo = check.goal_obligations(claim, field, *share)
+            found = prove(todo, degree, order + 1, exact, aims)
+            if found is not None:
+                shells.append(Shell(*share, found[0]))
+                least = min(least, found[1])
+            elif end - start <= NARROWEST:
+                return None
+            else:
+                middle = (start + end) / 2
+                waiting += [(middle, end), (start, middle)]
+    except Refused:
+        return None
+    return GoalRegion(rho, (1 - ROOM) * rho, axes, order, shells, least)

@@ -1,0 +1,155 @@
+"""`rtcd certify`: elites of a run folder in parallel processes, one line of progress, a table at the end."""
+
+import contextlib
+import io
+import os
+import queue
+import time
+from collections.abc import Iterator, Sequence
+from concurrent.futures import Future
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, final
+
+from rich.box import SIMPLE
+from rich.console import Console as Terminal
+from rich.table import Table
+from scipy.stats import spearmanr
+
+from rtcd_jax.certificate.prove.certify import Outcome, Step, certify_elite
+from rtcd_jax.certificate.prove.closed_loop import claim_of
+from rtcd_jax.elite.records import read_elite, require_elites
+from rtcd_jax.system.console import Console
+from rtcd_jax.system.files import make_folder, read_json, replace_json
+from rtcd_jax.system.processes import CONTEXT, processes
+
+POLL = 0.2
+"""Seconds between looks at the workers' progress."""
+RANKED = 3
+"""Elites from which on a rank correlation says something."""
+
+
+@final
+@dataclass(frozen=True)
+class Progress:
+    """All elites' certificates together, `done` of `total` thousandths of them."""
+
+    done: int
+    total: int
+    step: Step
+    elapsed: float
+
+    def __str__(self) -> str:
+        step, share = self.step, self.done / self.total
+        left = self.elapsed * (1 - share) / share if share else float("nan")
+        return (
+            f"elite {step.elite}  interval {step.knot + 1}/{step.knots}  back to t = {step.time:.3f} s"
+            f"  rho {step.rho:.4g}  margin {step.margin:.2g}/s  elapsed {self.elapsed:.0f} s  left {left:.0f} s"
+        )
+
+
+def certify_run(
+    folder: Path, elites: int, rung: str, workers: int, console: Console, optimize_value: bool = False
+) -> bool:
+    """Certificates of a run's best elites; True if every funnel was shown from t = 0 to the goal.
+
+    Stores `certificates/NNN.json` and `certificates/summary.json`. What was finished before a kill is not done again.
+
+    Raises:
+        UserError: no run folder, a run without elites, an elite that cannot be read or is of a plant that the checker
+            does not know, or a folder that cannot be written.
+    """
+    names = require_elites(folder)[:elites]
+    for name in names:  # at once, and not from a worker
+        claim_of(*read_elite(folder / "elites", name))
+    target = folder / "certificates"
+    make_folder(target)
+    summary = target / "summary.json"
+    former = read_json(summary, "remove it, or make it again") if summary.is_file() else {}
+    outcomes: dict[str, Outcome | None] = {}
+    began, reached = time.monotonic(), dict.fromkeys(names, 0.0)
+    for event in _events(folder, names, rung, workers, optimize_value):
+        if isinstance(event, Step):
+            reached[event.elite] = 1 - event.knot / event.knots
+            done = round(1000 * sum(reached.values()) / len(reached))
+            console.progress(Progress(done, 1000, event, time.monotonic() - began))
+        else:
+            outcomes[event[0]] = event[1]
+    replace_json(summary, former | {name: _summary(outcomes[name]) for name in names})
+    finished = [outcome for name in names if (outcome := outcomes[name]) is not None]
+    beside = "/".join(dict.fromkeys(outcome.beside for outcome in finished)) or "sampled"
+    console.message(_table(finished, f"volumes: {beside} / {rung}"))
+    if len(finished) >= RANKED:
+        correlation = rank_correlation(finished)
+        console.message(f"rank correlation of sampled and {rung} sums over {len(finished)} elites: {correlation:.3f}")
+    for name in names:
+        if outcomes[name] is None:
+            console.message(f"{name}: no goal region can be shown at any level that was tried")
+    for outcome in finished:
+        file = target / f"{outcome.elite}.json"
+        console.message(f"stored: {file}; `rtcd check {file}` checks it")
+    return all(outcome is not None and outcome.whole for outcome in outcomes.values())
+
+
+def _events(
+    folder: Path, names: Sequence[str], rung: str, workers: int, optimize_value: bool
+) -> Iterator[Step | tuple[str, Outcome | None]]:
+    """Steps of all elites as they come, and every elite's outcome by its name."""
+    # One thread each: there is a worker for every core, and small matrices in many threads cost ten times as much.
+    for library in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
+        os.environ.setdefault(library, "1")
+    steps = CONTEXT.Queue()
+    with processes(min(workers, len(names)), _remember, steps) as pool:
+        waiting: dict[Future, str] = {pool.submit(_work, folder, name, rung, optimize_value): name for name in names}
+        while waiting:
+            with contextlib.suppress(queue.Empty):
+                yield steps.get(timeout=POLL)
+            for future in [future for future in waiting if future.done()]:
+                yield waiting.pop(future), future.result()
+
+
+_steps: Any = None
+
+
+def _remember(steps: Any) -> None:
+    """In a worker: where its progress goes."""
+    global _steps
+    _steps = steps
+
+
+def _work(folder: Path, name: str, rung: str, optimize_value: bool) -> Outcome | None:
+    return certify_elite(folder, name, rung, _steps.put, optimize_value)
+
+
+def rank_correlation(outcomes: Sequence[Outcome]) -> float:
+    """Spearman's, between the sampled and the shown sums of volumes: 1 if the proof would rank the elites the same."""
+    sums = [[outcome.sampled["sum"], outcome.found["sum"]] for outcome in outcomes]
+    return float(spearmanr(sums)[0])
+
+
+def _summary(outcome: Outcome | None) -> dict[str, Any] | None:
+    return None if outcome is None else outcome._asdict()
+
+
+def _table(outcomes: Sequence[Outcome], title: str) -> str:
+    table = Table(box=SIMPLE, title=title)
+    table.add_column("elite")
+    for heading in ("from, s", "intervals", "took, s", "inlet", "sum", "ratio of sums", "integral", "goal"):
+        table.add_column(heading, justify="right")
+    for outcome in outcomes:
+        pairs = {key: f"{value:.4g} / {outcome.found[key]:.4g}" for key, value in outcome.sampled.items()}
+        sampled = outcome.sampled["sum"]
+        table.add_row(
+            outcome.elite,
+            f"{outcome.start:.4g}",
+            f"{outcome.intervals}",
+            f"{outcome.seconds:.1f}",
+            pairs["inlet"],
+            pairs["sum"],
+            f"{outcome.found['sum'] / sampled:.4f}" if sampled else "none",
+            pairs["integral"],
+            pairs["goal"],
+        )
+    text = io.StringIO()
+    Terminal(file=text, width=150).print(table)
+    return text.getvalue().rstrip()

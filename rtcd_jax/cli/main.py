@@ -1,0 +1,330 @@
+"""The console script `rtcd`: one thin function for each verb.
+
+Exit codes: 0 done; 1 the result breaks its promise; 2 the input is wrong; 75 another process of the run has ended;
+85 the system asked to stop, and the same command goes on; 130 interrupted; 141 nobody reads the output any more.
+Nothing heavy is imported before the input is known to be right.
+"""
+
+import os
+import sys
+from collections.abc import Callable, Sequence
+from concurrent.futures import BrokenExecutor
+from pathlib import Path
+from typing import Any, NoReturn
+
+from rtcd_jax.system.devices import cores, prepare_jax
+from rtcd_jax.system.errors import UserError, closest
+
+OK, BROKEN_PROMISE, WRONG_INPUT, LOST_PROCESS, PREEMPTED, INTERRUPTED, CUT_OFF = 0, 1, 2, 75, 85, 130, 141
+RUNS = Path("checkpoints")
+
+
+def optimize(arguments: Sequence[str]) -> int:
+    """search for the design and the weights with the largest funnel, or resume a search"""
+    from rtcd_jax.cli.search_options import read_optimize
+
+    config, options = read_optimize(arguments, RUNS)
+
+    def run(console, cluster) -> None:
+        from rtcd_jax.run.optimize import optimize as run_optimize
+
+        run_optimize(config, options.run, console, cluster)
+
+    return _on_cluster(options.machines, options.run, run)
+
+
+def sweep(arguments: Sequence[str]) -> int:
+    """make all the runs that a YAML's sweep section asks for, or one of them"""
+    from rtcd_jax.cli.search_options import read_sweep
+    from rtcd_jax.run.sweep import show
+
+    cases, options = read_sweep(arguments, RUNS)
+    if options.list:
+        print(show(cases, options.folder))
+        return OK
+
+    def run(console, cluster) -> None:
+        from rtcd_jax.run.optimize import optimize as run_optimize
+
+        failed = []
+        for case in cases if options.case is None else [cases[options.case]]:
+            console.message(f"case {case.number} of 0 … {len(cases) - 1}: {case.folder}")
+            try:
+                run_optimize(case.config, case.folder, console, cluster)
+            except UserError as error:  # the others may do better
+                console.message(f"case {case.number} ended early: {error}")
+                failed.append(case.folder.name)
+        cluster.on_first(lambda: console.message(show(cases, options.folder)))
+        if failed:
+            raise UserError(f"{len(failed)} of the cases ended early, see above: {', '.join(failed)}")
+
+    return _on_cluster(options.machines, options.folder, run)
+
+
+def _on_cluster(machines: Any, folder: Path, run: Callable[[Any, Any], None]) -> int:
+    """Joins the other processes of `machines`, if any, and runs `run(console, cluster)`; the exit code.
+
+    What ends early leaves the process at once.
+    """
+    prepare_jax(machines.cpu_devices)
+    from rtcd_jax.system.cluster import Cluster, Lost, Preempted, join, part
+
+    join(machines.coordinator, machines.num_processes, machines.process_id)  # before anything touches a device
+    from rtcd_jax.system.console import Console, silent
+
+    cluster = Cluster.of(machines.devices)
+    cluster.heed()
+    with Console() if cluster.first else silent() as console:
+        try:
+            cluster.meet()
+            run(console, cluster)
+        except Preempted:
+            console.message(f"asked to stop (SIGTERM): saved in {folder}; the same command goes on")
+            part()
+            _leave(PREEMPTED)
+        except Lost as error:
+            print(f"rtcd: {error}; start all of them again by the same command, to go on", file=sys.stderr)
+            _leave(LOST_PROCESS)
+        except UserError as error:
+            if cluster.processes == 1:
+                raise
+            print(f"rtcd: {error}", file=sys.stderr)
+            _leave(WRONG_INPUT)
+    return OK
+
+
+def _leave(code: int) -> NoReturn:
+    """Ends this process without waiting for what its devices still compute, or for other processes."""
+    sys.stdout.flush()
+    sys.stderr.flush()
+    os._exit(code)
+
+
+def scale(arguments: Sequence[str]) -> int:
+    """measure what a generation costs against population and devices"""
+    from rtcd_jax.cli.search_options import read_scale
+
+    config, options = read_scale(arguments, RUNS)
+    from rtcd_jax.analysis.scale.study import study
+    from rtcd_jax.system.console import Console
+
+    grid = options.counts("populations"), options.counts("devices")
+    with Console() as console:
+        study(options.config, config, *grid, options.repeats, options.folder, console)
+    return OK
+
+
+def verify(arguments: Sequence[str]) -> int:
+    """simulate fresh random states of a run's funnels with independent integrators"""
+    from rtcd_jax.cli.run_options import read_verify
+
+    options = read_verify(arguments)
+    prepare_jax()
+    from rtcd_jax.analysis.verify.run import verify_run
+    from rtcd_jax.system.console import Console
+
+    with Console() as console:
+        held = verify_run(options.run, options.states, options.seed, options.workers or cores(), console)
+        _refresh(options.run, console)
+    return OK if held else BROKEN_PROMISE
+
+
+def report(arguments: Sequence[str]) -> int:
+    """write a run's figures and its page, or compare several runs on one"""
+    from rtcd_jax.cli.run_options import read_report
+
+    options = read_report(arguments)
+    from rtcd_jax.analysis.report import report as write_report
+
+    page, *figures = write_report(options.runs, options.to)
+    print(f"{page}, and {len(figures)} figures in {figures[0].parent}")
+    return OK
+
+
+def _refresh(run: Path, console: Any) -> None:
+    """Brings the run's page up to date, if it has one. The verb's own results are stored already: no error ends it."""
+    from rtcd_jax.analysis.report import refresh
+
+    try:
+        page = refresh(run)
+    except UserError as error:
+        console.message(f"{run / 'report.html'} does not show this yet: {error}")
+    else:
+        if page:
+            console.message(f"{page} shows this, too")
+
+
+def animate(arguments: Sequence[str]) -> int:
+    """show the swing-up of a run's initial and best candidate as MP4 and GIF"""
+    from rtcd_jax.cli.run_options import read_animate
+
+    options = read_animate(arguments)
+    prepare_jax()
+    from rtcd_jax.analysis.animate.animate import animate_run
+    from rtcd_jax.system.console import Console
+
+    with Console() as console:
+        animate_run(options.run, options.to, options.seed, console)
+    return OK
+
+
+def replay(arguments: Sequence[str]) -> int:
+    """say whether a measured motion stayed inside a run's funnel"""
+    from rtcd_jax.cli.run_options import read_replay
+
+    options = read_replay(arguments)
+    from rtcd_jax.analysis.replay.replay import replay_run
+    from rtcd_jax.system.console import Console
+
+    with Console() as console:
+        kept = replay_run(options.run, options.file, options.elite, console)
+    return OK if kept else BROKEN_PROMISE
+
+
+def certify(arguments: Sequence[str]) -> int:
+    """prove the funnels of a run's elites by sums of squares"""
+    from rtcd_jax.cli.proof_options import read_certify
+
+    options = read_certify(arguments)
+    from rtcd_jax.certificate.prove.run import certify_run
+    from rtcd_jax.system.console import Console
+
+    with Console() as console:
+        workers = options.workers or cores()
+        whole = certify_run(options.run, options.elites, options.rung, workers, console, options.optimize_value)
+        _refresh(options.run, console)
+    return OK if whole else BROKEN_PROMISE
+
+
+def export(arguments: Sequence[str]) -> int:
+    """write the controller, its funnel monitor and the design of an elite for a lab"""
+    from rtcd_jax.cli.run_options import read_export
+
+    options = read_export(arguments)
+    prepare_jax()
+    from rtcd_jax.export import export_run
+    from rtcd_jax.system.console import Console
+
+    with Console() as console:
+        export_run(options.run, options.elite, options.to, console)
+    return OK
+
+
+def disturb(arguments: Sequence[str]) -> int:
+    """try a run's best elite and its initial candidate: off-nominal starts, pushes, wrong models, noise, delay"""
+    from rtcd_jax.cli.run_options import read_disturb
+
+    options = read_disturb(arguments)
+    prepare_jax()
+    from rtcd_jax.analysis.disturb import disturb_run
+    from rtcd_jax.system.console import Console
+
+    with Console() as console:
+        disturb_run(options.run, options.states, options.seed, console)
+        _refresh(options.run, console)
+    return OK
+
+
+def check(arguments: Sequence[str]) -> int:
+    """check a certificate file by exact arithmetic, without any solver"""
+    from rtcd_jax.certificate.check import main as check_main
+
+    return check_main(arguments)
+
+
+def falsify(arguments: Sequence[str]) -> int:
+    """simulate a great many motions of what a certificate says is proved"""
+    from rtcd_jax.cli.proof_options import read_falsify
+
+    options = read_falsify(arguments)
+    from rtcd_jax.certificate.falsify.falsify import falsify_file
+    from rtcd_jax.system.console import Console
+
+    with Console() as console:
+        held = falsify_file(options.certificate, options.rollouts, options.seed, options.workers or cores(), console)
+    return OK if held else BROKEN_PROMISE
+
+
+def audit(arguments: Sequence[str]) -> int:
+    """show where a funnel from outside fails, and mend its nominal for a proof"""
+    from rtcd_jax.cli.proof_options import read_audit
+
+    options = read_audit(arguments)
+    from rtcd_jax.certificate.audit.audit import audit as run_audit
+    from rtcd_jax.certificate.audit.external import Cost, read_outside
+    from rtcd_jax.system.console import Console
+
+    given = read_outside(options.file, options.plant, options.numbers)
+    cost = Cost.of(given, options.q, options.r, options.state_limits)
+    with Console() as console:
+        held = run_audit(given, cost, options.states, options.seed, options.out, console)
+    return OK if held else BROKEN_PROMISE
+
+
+VERBS: dict[str, Callable[[Sequence[str]], int]] = {
+    "optimize": optimize,
+    "sweep": sweep,
+    "scale": scale,
+    "verify": verify,
+    "report": report,
+    "animate": animate,
+    "replay": replay,
+    "certify": certify,
+    "disturb": disturb,
+    "export": export,
+    "check": check,
+    "falsify": falsify,
+    "audit": audit,
+}
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Runs one verb and returns the exit code; `--help` and unknown options of a verb exit by themselves."""
+    verb, *rest = (sys.argv[1:] if arguments is None else arguments) or ["--help"]
+    if verb in ("-h", "--help"):
+        print(_usage())
+        return OK
+    if verb == "--version":
+        print(_version())
+        return OK
+    try:
+        if verb not in VERBS:
+            raise UserError(f"unknown command {verb!r}; {closest(verb, tuple(VERBS))}")
+        return VERBS[verb](rest)
+    except UserError as error:
+        print(f"rtcd: {error}", file=sys.stderr)
+        return WRONG_INPUT
+    except BrokenPipeError:  # the reader, say `head`, has had enough
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return CUT_OFF
+    except OSError as error:  # no bug's: a path that may not be read, a disk that is full
+        where = f"{error.filename}: " if error.filename else ""
+        print(f"rtcd: {where}{error.strerror or error}", file=sys.stderr)
+        return WRONG_INPUT
+    except BrokenExecutor:
+        print("rtcd: a worker process was ended from outside, for want of memory perhaps: try fewer", file=sys.stderr)
+        return LOST_PROCESS
+    except KeyboardInterrupt:
+        print("stopped; run the same command to go on", file=sys.stderr)
+        return INTERRUPTED
+
+
+def _usage() -> str:
+    width = max(map(len, VERBS))
+    return "\n".join(
+        [
+            "usage: rtcd COMMAND …",
+            "",
+            "Robust co-design of underactuated robots.",
+            "",
+            *(f"  {name:{width}}  {verb.__doc__}" for name, verb in VERBS.items()),
+            "",
+            "`rtcd COMMAND --help` lists a command's options; `rtcd --version` prints the version.",
+        ]
+    )
+
+
+def _version() -> str:
+    from importlib.metadata import version
+
+    return f"rtcd {version('rtcd-jax')}"

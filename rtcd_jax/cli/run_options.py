@@ -1,0 +1,147 @@
+"""Options of the commands that read a finished run: verify, report, animate, replay, disturb, export."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+
+from rtcd_jax.cli.checks import require_at_least, require_elite, require_run
+from rtcd_jax.cli.search_options import OPTIMIZE_USAGE
+from rtcd_jax.system.errors import UserError
+
+
+@dataclass(frozen=True)
+class VerifyOptions:
+    """Simulate fresh random states of a run's funnels with independent integrators; exit code 1 if too many fail.
+
+    The same command goes on after a stop.
+
+    Example: rtcd verify checkpoints/pendulum_rtcd --states 100000
+    """
+
+    run: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RUN", help="the run folder")]
+    states: Annotated[int, tyro.conf.arg(help="fresh states, over the ellipsoids of all knots [-] (>= knots)")] = 1000
+    seed: Annotated[int, tyro.conf.arg(help="of the states [-] (>= 0)")] = 0
+    workers: Annotated[int, tyro.conf.arg(help="processes, 0 for one a core [-] (>= 0)")] = 0
+
+
+@dataclass(frozen=True)
+class ReportOptions:
+    """Write a finished run's page, report.html, and its figures; several runs are compared on one page.
+
+    Example: rtcd report checkpoints/pendulum_rtc checkpoints/pendulum_rtcd --to comparison.html
+    """
+
+    runs: Annotated[
+        tyro.conf.Positional[tuple[Path, ...]], tyro.conf.arg(metavar="RUN [RUN …]", help="the run folders")
+    ]
+    to: Annotated[Path | None, tyro.conf.arg(metavar="FILE", help="the page; by default in or beside the run")] = None
+
+
+@dataclass(frozen=True)
+class AnimateOptions:
+    """Show the swing-up by MuJoCo's renderer as MP4 and GIF: initial beside best, undisturbed and disturbed.
+
+    Needs no display: it draws by EGL or OSMesa.
+
+    Example: rtcd animate checkpoints/pendulum_rtcd --to videos
+    """
+
+    run: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RUN", help="the run folder")]
+    to: Annotated[Path | None, tyro.conf.arg(metavar="DIR", help="for the videos; by default animation/ in RUN")] = None
+    seed: Annotated[int, tyro.conf.arg(help="of the disturbed start, from the first ellipsoid [-] (>= 0)")] = 0
+
+
+@dataclass(frozen=True)
+class ReplayOptions:
+    """Was a measured run inside the funnel? V/rho of every sample; exit code 1 if it left.
+
+    FILE has the columns time,pos,vel,torque or time,pos1,pos2,vel1,vel2,tau1,tau2 in SI units, the time from the start
+    of the swing-up. Errors of angles are not wrapped: unwrap the encoder first.
+
+    Example: rtcd replay checkpoints/pendulum_rtcd measured.csv --elite 0
+    """
+
+    run: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RUN", help="the run folder")]
+    file: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="FILE", help="the measured states, a CSV file")]
+    elite: Annotated[
+        int | Literal["initial"], tyro.conf.arg(metavar="K", help="whose funnel; 0 is the best [-] (>= 0); or initial")
+    ] = 0
+
+
+@dataclass(frozen=True)
+class DisturbOptions:
+    """Try the initial candidate and the best elite: off-nominal starts, pushes, wrong models, noise, delay.
+
+    Example: rtcd disturb checkpoints/pendulum_rtcd --states 1000
+    """
+
+    run: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RUN", help="the run folder")]
+    states: Annotated[int, tyro.conf.arg(help="uniform states of every first ellipsoid [-] (>= 1)")] = 1000
+    seed: Annotated[int, tyro.conf.arg(help="of states, noise and perturbations [-] (>= 0)")] = 0
+
+
+@dataclass(frozen=True)
+class ExportOptions:
+    """Write an elite for a lab: controller and funnel monitor in Python and C, tables, MJCF and URDF.
+
+    Example: rtcd export checkpoints/pendulum_rtcd --to lab/pendulum
+    """
+
+    run: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RUN", help="the run folder")]
+    to: Annotated[Path, tyro.conf.arg(metavar="DIR", help="a new or empty folder, or a former export, to replace it")]
+    elite: Annotated[
+        int | Literal["initial"], tyro.conf.arg(metavar="K", help="0 is the best [-] (>= 0); or initial")
+    ] = 0
+
+
+def read_verify(arguments: Sequence[str]) -> VerifyOptions:
+    """The checked options of `rtcd verify`; `UserError` if one is out of range."""
+    options = tyro.cli(VerifyOptions, args=arguments, prog="rtcd verify", use_underscores=True)
+    require_at_least(options, states=1, seed=0, workers=0)
+    require_run(options.run, OPTIMIZE_USAGE)
+    return options
+
+
+def read_report(arguments: Sequence[str]) -> ReportOptions:
+    """The checked options of `rtcd report`; `UserError` if a run is missing."""
+    options = tyro.cli(ReportOptions, args=arguments, prog="rtcd report", use_underscores=True)
+    if not options.runs:
+        raise UserError("which run? rtcd report RUN [RUN …] [--to FILE]")
+    for run in options.runs:
+        require_run(run, OPTIMIZE_USAGE)
+    return options
+
+
+def read_animate(arguments: Sequence[str]) -> AnimateOptions:
+    """The checked options of `rtcd animate`; `UserError` if one is out of range."""
+    options = tyro.cli(AnimateOptions, args=arguments, prog="rtcd animate", use_underscores=True)
+    require_at_least(options, seed=0)
+    require_run(options.run, OPTIMIZE_USAGE)
+    return options
+
+
+def read_replay(arguments: Sequence[str]) -> ReplayOptions:
+    """The checked options of `rtcd replay`; `UserError` if one is out of range."""
+    options = tyro.cli(ReplayOptions, args=arguments, prog="rtcd replay", use_underscores=True)
+    require_elite(options.elite)
+    require_run(options.run, OPTIMIZE_USAGE)
+    return options
+
+
+def read_disturb(arguments: Sequence[str]) -> DisturbOptions:
+    """The checked options of `rtcd disturb`; `UserError` if one is out of range."""
+    options = tyro.cli(DisturbOptions, args=arguments, prog="rtcd disturb", use_underscores=True)
+    require_at_least(options, states=1, seed=0)
+    require_run(options.run, OPTIMIZE_USAGE)
+    return options
+
+
+def read_export(arguments: Sequence[str]) -> ExportOptions:
+    """The checked options of `rtcd export`; `UserError` if one is out of range."""
+    options = tyro.cli(ExportOptions, args=arguments, prog="rtcd export", use_underscores=True)
+    require_elite(options.elite)
+    require_run(options.run, OPTIMIZE_USAGE)
+    return options

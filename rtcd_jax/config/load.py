@@ -1,0 +1,268 @@
+"""The experiment: one YAML as a frozen model of sections. Knows no JAX.
+
+`load` reads a file, `parse` a mapping; both raise `ConfigError` with everything that is wrong at once.
+"""
+
+import hashlib
+import inspect
+import json
+import re
+from collections.abc import Callable, Collection, Iterator, Mapping
+from pathlib import Path
+from typing import Annotated, Any
+
+import yaml
+from pydantic import (
+    Field,
+    PlainValidator,
+    SerializeAsAny,
+    ValidationError,
+    ValidationInfo,
+    create_model,
+    field_validator,
+)
+
+from rtcd_jax.config.schema import (
+    CheckpointConfig,
+    ElitesConfig,
+    FunnelConfig,
+    PlantConfig,
+    PolicyConfig,
+    SearchConfig,
+    TaskConfig,
+    TrajectoryConfig,
+    Variable,
+    WeightsConfig,
+    read_plant,
+)
+from rtcd_jax.config.settings import Settings, problems_of
+from rtcd_jax.system.errors import ConfigError, Problem, closest
+
+EXAMPLE = """\
+plant: {name: pendulum}
+task: {start: [0, 0], goal: [3.141592653589793, 0], state_limits: [6.283185307179586, 7]}
+design: {mass: {initial: 0.7, min: 0.6, max: 0.8}, length: {initial: 0.4, min: 0.4, max: 0.6}}
+weights:
+  q: [{initial: 10, min: 1, max: 10}, {initial: 1, min: 1, max: 10}]
+  r: [{initial: 0.1, min: 0.001, max: 10}]
+"""
+"""The shortest complete YAML: the paper's pendulum with the default settings."""
+
+
+class Config(Settings):
+    """Everything that defines a run."""
+
+    plant: Annotated[SerializeAsAny[PlantConfig], PlainValidator(read_plant)] = Field(description="the robot")
+    task: TaskConfig = Field(description="from where to where, and within what")
+    design: dict[str, Variable] = Field(description="the plant's design fields by name")
+    weights: WeightsConfig = Field(description="cost weights, searched on a log scale")
+    trajectory: TrajectoryConfig = Field(default=TrajectoryConfig(), description="the nominal motion")
+    policy: PolicyConfig = Field(default=PolicyConfig(), description="the controller that tracks it")
+    funnel: FunnelConfig = Field(default=FunnelConfig(), description="how the funnel is sampled")
+    search: SearchConfig = Field(default=SearchConfig(), description="CMA-ES over designs and weights")
+    elites: ElitesConfig = Field(default=ElitesConfig(), description="the archive of the best")
+    checkpoint: CheckpointConfig = Field(default=CheckpointConfig(), description="when the state is saved")
+
+    @field_validator("design")
+    @classmethod
+    def _in_plants_order(cls, design: dict[str, Variable], info: ValidationInfo) -> dict[str, Variable]:
+        names = info.data["plant"].design if "plant" in info.data else ()
+        known = {name: design[name] for name in names if name in design}
+        return known | design
+
+    def problems(self) -> Iterator[Problem]:
+        return _across_sections(dict(self))
+
+    def variables(self) -> dict[str, Variable]:
+        """Every variable by its dotted key: the design in the plant's order, then q, r, and the policy's."""
+        found = {f"design.{name}": variable for name, variable in self.design.items()}
+        for letter, variables in self.weights:
+            found |= {f"weights.{letter}.{i}": variable for i, variable in enumerate(variables)}
+        return found | {f"policy.{name}": variable for name, variable in self.policy.variables().items()}
+
+
+def _sizes(plant: PlantConfig, task: TaskConfig) -> Iterator[Problem]:
+    for key, value in task:
+        yield from _size(("task", key), value, plant.states)
+
+
+def _weight_sizes(plant: PlantConfig, weights: WeightsConfig) -> Iterator[Problem]:
+    yield from _size(("weights", "q"), weights.q, plant.states)
+    yield from _size(("weights", "r"), weights.r, plant.inputs)
+
+
+def _size(path: tuple[str, ...], values: tuple, names: Collection[str]) -> Iterator[Problem]:
+    if len(values) != len(names):
+        plural = "entry" if len(names) == 1 else "entries"
+        yield Problem(path, f"must have {len(names)} {plural} ({', '.join(names)}), has {len(values)}")
+
+
+def _ends(task: TaskConfig) -> Iterator[Problem]:
+    for key in ("start", "goal"):
+        for i, (value, limit) in enumerate(zip(getattr(task, key), task.state_limits, strict=False)):
+            if abs(value) > limit:
+                yield Problem(("task", key, i), f"must lie in [-{limit:g}, {limit:g}] (task.state_limits)", value)
+    if task.start == task.goal:
+        yield Problem(("task", "goal"), "must differ from task.start", task.goal)
+
+
+def _design_names(plant: PlantConfig, design: dict[str, Variable]) -> Iterator[Problem]:
+    for name in design:
+        if name not in plant.design:
+            yield Problem(
+                ("design", name), f"unknown design field of {plant.name}; {closest(name, tuple(plant.design))}"
+            )
+    for name in plant.design:
+        if name not in design:
+            yield Problem(("design", name), f"is missing; {plant.name}'s design is {', '.join(plant.design)}")
+
+
+def _positive_design(design: dict[str, Variable]) -> Iterator[Problem]:
+    for name, variable in design.items():
+        if variable.min <= 0:
+            yield Problem(("design", name, "min"), "must be > 0: masses and lengths are positive", variable.min)
+
+
+def _positive_weights(weights: WeightsConfig) -> Iterator[Problem]:
+    for letter, variables in weights:
+        for i, variable in enumerate(variables):
+            if variable.min <= 0:
+                yield Problem(("weights", letter, i, "min"), "must be > 0: weights have a log scale", variable.min)
+
+
+def _something_free(
+    design: dict[str, Variable], weights: WeightsConfig, policy: PolicyConfig, search: SearchConfig
+) -> Iterator[Problem]:
+    designs = any(variable.free for variable in design.values())
+    tunable = any(variable.free for variable in (*weights.q, *weights.r, *policy.variables().values()))
+    if not designs and not tunable:
+        yield Problem((), "nothing to search: every variable is pinned or has min = max")
+    elif search.mode == "nested" and not (designs and tunable):
+        text = "needs a free design variable and a free weight; use 'joint'"
+        yield Problem(("search", "mode"), text, search.mode)
+
+
+_ACROSS: tuple[Callable[..., Iterator[Problem]], ...] = (
+    _sizes,
+    _weight_sizes,
+    _ends,
+    _design_names,
+    _positive_design,
+    _positive_weights,
+    _something_free,
+)
+
+
+def _across_sections(sections: Mapping[str, Any]) -> Iterator[Problem]:
+    """Checks between sections; one runs as soon as all the sections that it names are there."""
+    for check in _ACROSS:
+        needed = inspect.signature(check).parameters
+        if needed.keys() <= sections.keys():
+            yield from check(**{name: sections[name] for name in needed})
+
+
+def _valid_sections(data: Mapping[str, Any], failed: set[str | int]) -> dict[str, Any]:
+    fields: dict[str, Any] = {
+        name: (field.annotation, field) for name, field in Config.model_fields.items() if name not in failed
+    }
+    sections = create_model("Sections", **fields)
+    return dict(sections.model_validate({name: data[name] for name in fields if name in data}))
+
+
+def parse(data: Any, source: str = "configuration") -> Config:
+    """The configuration that a mapping describes; `ConfigError` names everything that is wrong with it."""
+    try:
+        return Config.model_validate(data)
+    except ValidationError as error:
+        problems = problems_of(error)
+    if isinstance(data, Mapping):
+        # pydantic checks between sections only if every section is valid: run those that can be run.
+        failed = {problem.path[0] for problem in problems if problem.path}
+        found = _across_sections(_valid_sections(data, failed))
+        problems += [problem for problem in found if problem not in problems]
+    raise ConfigError(problems, source)
+
+
+class _Loader(yaml.SafeLoader):
+    """PyYAML's safe loader, but 1e-3 is a number, as in YAML 1.2, and a key given twice is an error."""
+
+    def construct_mapping(self, node, deep=False):
+        seen = set()
+        for key, _ in node.value:
+            if isinstance(key, yaml.ScalarNode) and key.value in seen:
+                raise yaml.MarkedYAMLError(problem=f"the key {key.value!r} is given twice", problem_mark=key.start_mark)
+            seen.add(str(key.value))
+        return super().construct_mapping(node, deep)
+
+
+_EXPONENT_WITHOUT_DOT = re.compile(r"[-+]?\d+[eE][-+]?\d+$")
+_Loader.add_implicit_resolver("tag:yaml.org,2002:float", _EXPONENT_WITHOUT_DOT, list("-+0123456789"))
+
+
+def parse_yaml(text: str | bytes, source: str = "configuration") -> Config:
+    """The configuration that a YAML text describes; `ConfigError` if it is no YAML or no valid configuration."""
+    return parse(_plain_yaml(text, source), source)
+
+
+def _plain_yaml(text: str | bytes, source: str) -> Any:
+    try:
+        return yaml.load(text, _Loader)
+    except yaml.MarkedYAMLError as error:
+        mark = error.problem_mark
+        place = f"line {mark.line + 1}, column {mark.column + 1}: " if mark else ""
+        raise ConfigError([Problem((), f"no valid YAML: {place}{error.problem}")], source) from None
+    except yaml.YAMLError as error:
+        raise ConfigError([Problem((), f"no valid YAML: {error}")], source) from None
+
+
+def load(path: Path) -> Config:
+    """The configuration in a YAML file; `ConfigError` names everything that is wrong with it."""
+    data = read_yaml(path)
+    if isinstance(data, Mapping) and "sweep" in data:
+        problem = Problem(("sweep",), f"makes several runs of this file: they are started by `rtcd sweep {path}`")
+        raise ConfigError([problem], str(path))
+    return parse(data, str(path))
+
+
+def read_yaml(path: Path) -> Any:
+    """What a YAML file holds, as it stands there; `ConfigError` if there is no such file, or no YAML in it."""
+    if not path.is_file():
+        folder, what = (path, "is a folder") if path.is_dir() else (path.parent, "no such file")
+        there = sorted(str(other) for other in folder.glob("*.y*ml"))
+        advice = closest(path, there) if there else f"{folder} has no YAML file"
+        raise ConfigError([Problem((), f"{what}; {advice}")], str(path))
+    return _plain_yaml(path.read_bytes(), str(path))
+
+
+def resolved(config: Config) -> dict[str, Any]:
+    """Every key with its value, defaults included, as plain mappings, lists and numbers."""
+    return json.loads(config.model_dump_json())
+
+
+def dump(config: Config) -> str:
+    """The resolved configuration as YAML; `parse_yaml` reads it back to an equal one."""
+    return yaml.safe_dump(resolved(config), sort_keys=False, default_flow_style=None, width=120)
+
+
+def config_hash(config: Config) -> str:
+    """Twelve hexadecimal digits of the SHA-256 of the canonical JSON: equal exactly for equal configurations."""
+    canonical = json.dumps(resolved(config), sort_keys=True, separators=(",", ":"))
+    return hashlib.sha256(canonical.encode()).hexdigest()[:12]
+
+
+def differences(old: Config, new: Config) -> dict[str, tuple[Any, Any]]:
+    """The dotted keys in which two configurations differ, with both values; None where a key is not there."""
+    before, after = _flat(resolved(old)), _flat(resolved(new))
+    keys = dict.fromkeys([*before, *after])
+    return {key: (before.get(key), after.get(key)) for key in keys if before.get(key) != after.get(key)}
+
+
+def _flat(tree: Any, path: str = "") -> dict[str, Any]:
+    if isinstance(tree, dict):
+        branches = tree.items()
+    elif isinstance(tree, list):
+        branches = enumerate(tree)
+    else:
+        return {path: tree}
+    prefix = f"{path}." if path else ""
+    return {key: leaf for name, branch in branches for key, leaf in _flat(branch, f"{prefix}{name}").items()}

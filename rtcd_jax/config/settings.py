@@ -1,0 +1,102 @@
+"""Frozen pydantic models that say what is wrong with their data in the words of `errors`."""
+
+from collections.abc import Iterable, Iterator
+from typing import Self, get_args
+
+from pydantic import BaseModel, ConfigDict, ValidationError, model_validator
+from pydantic.fields import FieldInfo
+from pydantic_core import ErrorDetails, InitErrorDetails, PydanticCustomError
+
+from rtcd_jax.system.errors import NO_VALUE, Problem, closest
+
+_KINDS = {
+    "float_type": "a number",
+    "int_type": "a whole number",
+    "int_from_float": "a whole number",
+    "bool_type": "true or false",
+    "string_type": "a text",
+    "tuple_type": "a list",
+    "dict_type": "a mapping",
+    "finite_number": "finite",
+}
+_BOUNDS = {"gt": ">", "ge": ">=", "lt": "<", "le": "<="}
+_BOUND_ERRORS = ("greater_than", "greater_than_equal", "less_than", "less_than_equal")
+
+
+class Settings(BaseModel):
+    """A frozen section of the configuration: no unknown keys, no coercion but int to float, no NaN."""
+
+    model_config = ConfigDict(
+        frozen=True, extra="forbid", strict=True, allow_inf_nan=False, ser_json_inf_nan="constants"
+    )
+
+    def problems(self) -> Iterator[Problem]:
+        """What is wrong between fields that are valid one by one; paths start at this section."""
+        return iter(())
+
+    @model_validator(mode="wrap")
+    @classmethod
+    def _teach(cls, data, handler) -> Self:
+        try:
+            settings = handler(data)
+        except ValidationError as error:
+            raise invalid(_taught(cls, details) for details in error.errors()) from None
+        problems = tuple(settings.problems())
+        if problems:
+            raise invalid(problems)
+        return settings
+
+
+def invalid(problems: Iterable[Problem]) -> ValidationError:
+    """The problems as one pydantic error; an enclosing model prepends its own path to theirs."""
+    return ValidationError.from_exception_data("configuration", [_line(problem) for problem in problems])
+
+
+def problems_of(error: ValidationError) -> list[Problem]:
+    """The inverse of `invalid`."""
+    return [_problem(details) for details in error.errors()]
+
+
+def bounds(field: FieldInfo) -> str:
+    """The field's own range, such as `> 0 and <= 1`; empty if it has none."""
+    limits = ((sign, getattr(item, name, None)) for item in field.metadata for name, sign in _BOUNDS.items())
+    return " and ".join(f"{sign} {limit}" for sign, limit in limits if limit is not None)
+
+
+def _line(problem: Problem) -> InitErrorDetails:
+    # The text travels in the context: pydantic would expand braces in a message template.
+    kind = PydanticCustomError("problem", "{text}", {"text": problem.text, "shown": problem.value is not NO_VALUE})
+    return InitErrorDetails(type=kind, loc=problem.path, input=None if problem.value is NO_VALUE else problem.value)
+
+
+def _problem(details: ErrorDetails) -> Problem:
+    context = details.get("ctx", {})
+    return Problem(details["loc"], context["text"], details["input"] if context["shown"] else NO_VALUE)
+
+
+def _taught(model: type[Settings], details: ErrorDetails) -> Problem:
+    """pydantic's error in the words of `model`, whose validation raised it; deeper models have already taught."""
+    kind, path = details["type"], details["loc"]
+    if kind == "problem":
+        return _problem(details)
+    if not path:
+        return Problem(path, f"must be a mapping with the keys {', '.join(model.model_fields)}", details["input"])
+    if kind == "extra_forbidden":
+        return Problem(path, f"unknown key; {closest(path[0], tuple(model.model_fields))}", details["input"])
+    field = model.model_fields[str(path[0])]
+    if kind == "literal_error":
+        return Problem(path, f"unknown name; {closest(details['input'], get_args(field.annotation))}", details["input"])
+    meaning = f"; {field.description}" if field.description else ""
+    if kind == "missing":
+        return Problem(path, f"is missing{meaning}")
+    return Problem(path, f"{_expectation(field, details)}{meaning}", details["input"])
+
+
+def _expectation(field: FieldInfo, details: ErrorDetails) -> str:
+    kind, context = details["type"], details.get("ctx", {})
+    if kind in _KINDS:
+        return f"must be {_KINDS[kind]}"
+    if kind in _BOUND_ERRORS:
+        ((name, limit),) = ((name, limit) for name, limit in context.items() if name in _BOUNDS)
+        return f"must be {bounds(field) or f'{_BOUNDS[name]} {limit}'}"
+    return str(details["msg"])

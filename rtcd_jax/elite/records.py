@@ -1,0 +1,122 @@
+"""The files of a run folder, each by itself: what is read and written here needs neither JAX nor orbax.
+
+    format.json                the mark of a run folder and its format's version
+    config.yaml                the resolved configuration
+    generations.jsonl          one line a generation
+    initial.npz, initial.json  the configuration's initial candidate
+    elites/NNN.npz, NNN.json   the best candidates, 000 first
+
+Numbers that are not finite are stored as null.
+"""
+
+import io
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from rtcd_jax.config import load as configuration
+from rtcd_jax.config.load import Config
+from rtcd_jax.system.errors import UserError
+from rtcd_jax.system.files import read_json, reading, replace, replace_json
+
+FORMAT = "rtcd_jax run"
+VERSION = 1
+_RESTORE = "restore it, or make the run again"
+
+Arrays = Mapping[str, np.ndarray]
+Record = Mapping[str, Any]
+
+
+def write_elite(folder: Path, name: str, arrays: Arrays, record: Record) -> None:
+    """Writes NAME.npz, then NAME.json; equal contents give equal bytes.
+
+    Raises TypeError for an array or a value that other programs could not read.
+    """
+    for key, array in arrays.items():
+        if not isinstance(array, np.ndarray) or array.dtype.kind not in "fiub":
+            raise TypeError(f"{name}.npz: {key} must be a numpy array of numbers, got {type(array).__name__}")
+    file = io.BytesIO()
+    np.savez(file, **arrays)  # type: ignore[arg-type]
+    replace(folder / f"{name}.npz", file.getvalue())
+    replace_json(folder / f"{name}.json", record)
+
+
+def read_elite(folder: Path, name: str) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+    """The arrays and the record of `folder`/NAME.
+
+    Raises:
+        UserError: it is not there (the error has the names that are), or one of its files is damaged.
+    """
+    paths = [folder / f"{name}.{suffix}" for suffix in ("npz", "json")]
+    if not all(path.is_file() for path in paths):
+        there = ", ".join(sorted(path.stem for path in folder.glob("*.npz"))) or "nothing"
+        raise UserError(f"{folder} has no {name}.npz with its {name}.json; there is {there}")
+    with reading(paths[0], _RESTORE), paths[0].open("rb") as file, np.load(file, allow_pickle=False) as stored:
+        arrays = dict(stored)
+    record = read_json(paths[1], _RESTORE)
+    if not record:
+        raise UserError(f"{paths[1]} says nothing of its elite; {_RESTORE}")
+    return arrays, record
+
+
+def elite_names(path: Path) -> list[str]:
+    """Names of the elites in a run folder, best first."""
+    return sorted((file.stem for file in (path / "elites").glob("*.json") if file.stem.isdecimal()), key=int)
+
+
+def require_elites(path: Path) -> list[str]:
+    """`elite_names` of a run folder. Raises UserError if it is none, or its search is not finished."""
+    names = elite_names(path)
+    if not names:
+        _require_run(path)
+        raise UserError(f"{path} has no elites yet: finish the run first, by the command that began it")
+    return names
+
+
+def read_config(path: Path) -> Config:
+    """The configuration of a run. Raises UserError if the folder is no run folder that this version reads."""
+    _require_run(path)
+    require_format(path)
+    return stored_config(path)
+
+
+def _require_run(path: Path) -> None:
+    if not (path / "format.json").is_file():
+        raise UserError(f"{path} is no run folder: it has no format.json")
+
+
+def read_generations(path: Path) -> list[dict[str, Any]]:
+    """The generations of a run, null for what was not finite; a torn last line is left out.
+
+    Raises UserError, with the line, if another one is damaged.
+    """
+    lines = path / "generations.jsonl"
+    found = []
+    with reading(lines, _RESTORE), lines.open("rb") as file:
+        for number, line in enumerate(file, 1):
+            if line.endswith(b"\n"):
+                with reading(Path(f"{lines}, line {number}"), _RESTORE):
+                    found.append(dict(json.loads(line)))
+    return found
+
+
+def require_format(path: Path) -> None:
+    """Raises UserError if the folder's mark is not that of this version."""
+    file = path / "format.json"
+    mark = read_json(file, "choose another folder")
+    name, version = mark.get("format"), mark.get("version")
+    if (name, version) != (FORMAT, VERSION):
+        raise UserError(
+            f"{file} says {name!r}, version {version!r}, but this rtcd_jax reads {FORMAT!r}, version {VERSION}: "
+            "go on with the version in provenance.json, or choose another folder"
+        )
+
+
+def stored_config(path: Path) -> Config:
+    """The configuration in a folder whose mark was checked. Raises UserError if it is damaged."""
+    file = path / "config.yaml"
+    with reading(file, _RESTORE):
+        return configuration.parse_yaml(file.read_bytes(), str(file))

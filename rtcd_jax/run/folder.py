@@ -1,0 +1,289 @@
+"""The run folder as a run holds it: locked, with all that it needs to go on after a kill at any moment.
+
+Beside the files of records.py, process 0 writes
+
+    provenance.json            versions, device, commit and working time of every start of the run
+    state/                     checkpoints of the search, the latest two
+
+Every file but the JSON lines is replaced as a whole; the lines are cut back to the checkpoint at a resume. Orbax and
+JAX are imported where states are kept.
+"""
+
+import contextlib
+import fcntl
+import itertools
+import json
+import os
+import socket
+import time
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Self, TypeVar, final
+
+import numpy as np
+
+from rtcd_jax.config import load as configuration
+from rtcd_jax.config.load import Config
+from rtcd_jax.elite.records import (
+    FORMAT,
+    VERSION,
+    Arrays,
+    Record,
+    elite_names,
+    require_format,
+    stored_config,
+    write_elite,
+)
+from rtcd_jax.system.errors import UserError
+from rtcd_jax.system.files import (
+    is_temporary,
+    make_folder,
+    plain,
+    read_json,
+    reading,
+    replace,
+    replace_json,
+    sync,
+    writing,
+)
+from rtcd_jax.system.provenance import provenance
+
+if TYPE_CHECKING:
+    from rtcd_jax.system.cluster import Cluster
+
+KEPT_STATES = 2
+_LOCK = ".lock"
+_FORGET = "restore it, or remove it: the run then goes on without its history"
+
+State = TypeVar("State")
+
+
+@final
+class RunFolder:
+    """A run folder that this run alone may write. A context manager: leaving it frees the folder.
+
+    All processes of a run open it and call its methods alike: process 0 writes, states are saved by all together.
+    Every method raises UserError, naming the path, where the folder cannot be written.
+    """
+
+    def __init__(self, path: Path, seconds: float, cluster: "Cluster", checkpointer: Any, held: contextlib.ExitStack):
+        self.path = path
+        self._seconds = seconds
+        self._cluster = cluster
+        self._checkpointer = checkpointer
+        self._held = held
+        self._begun = self._saved = time.monotonic()
+
+    @classmethod
+    def open(cls, path: Path, config: Config, cluster: "Cluster | None" = None) -> Self:
+        """The folder of a new run, or of the one that `config` began: then `restore` gives the state to go on from.
+
+        Without a `cluster` it is that of this process' devices.
+
+        Raises UserError if the folder holds something else, a run of another configuration (every differing key with
+        both values) or of another format, if another run works on it, or if the processes were not started alike.
+        """
+        if cluster is None:
+            from rtcd_jax.system.cluster import Cluster
+
+            cluster = Cluster.of()
+        cluster.require_alike("configuration", configuration.config_hash(config))
+        with contextlib.ExitStack() as stack:
+            cluster.on_first(lambda: stack.enter_context(_prepared(path, config)))
+            checkpointer = stack.enter_context(_checkpoints(path / "state"))
+            return cls(path, config.checkpoint.seconds, cluster, checkpointer, stack.pop_all())
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Frees the folder for other processes."""
+        self._held.close()
+
+    @property
+    def _state_path(self) -> Path:
+        return self.path / "state"
+
+    @property
+    def _lines_path(self) -> Path:
+        return self.path / "generations.jsonl"
+
+    def restore(self, state: State) -> State:
+        """The latest saved state, or `state` if there is none; later lines of generations.jsonl are cut off.
+
+        `state` is that of a search that has not begun: its arrays say the shapes. Raises UserError if the saved one
+        has others, or if lines are missing.
+        """
+        latest = self._checkpointer.latest
+        self._cluster.on_first(lambda: self._cut(latest.step if latest else 0))
+        return _load(self._checkpointer, self._cluster.replicated(state)) if latest else state
+
+    def append(self, record: Record) -> None:
+        """Adds a generation to generations.jsonl."""
+        line = json.dumps(plain(record), allow_nan=False) + "\n"
+        self._cluster.on_first(lambda: self._append(line.encode()))
+
+    def _append(self, line: bytes) -> None:
+        with writing(self._lines_path), self._lines_path.open("ab") as file:
+            file.write(line)
+
+    def save_if_due(self, state: Any, generation: int) -> bool:
+        """Saves if `checkpoint.seconds` have passed since the last save; says whether it did."""
+        due = bool(self._cluster.agreed(np.asarray(time.monotonic() - self._saved >= self._seconds)))
+        if due:
+            self.save(state, generation)
+        return due
+
+    def save(self, state: Any, generation: int) -> None:
+        """Keeps the state after `generation` generations, all of them appended before; waits until it is on disk."""
+        self._cluster.on_first(lambda: sync(self._lines_path))
+        latest = self._checkpointer.latest
+        if latest is None or latest.step != generation:
+            # tensorstore tells of a full disk by ValueError.
+            with writing(self._state_path, (OSError, ValueError)):
+                self._checkpointer.save(generation, self._cluster.replicated(state), force=True)
+        self._cluster.on_first(self.tell_time)
+        self._saved = time.monotonic()
+
+    def tell_time(self) -> None:
+        """Notes in provenance.json how long this start has worked [s]; a kill leaves what the latest save noted.
+
+        For process 0.
+        """
+        file = self.path / "provenance.json"
+        told = read_json(file, _FORGET)
+        told["starts"][-1]["seconds"] = round(time.monotonic() - self._begun, 1)
+        replace_json(file, told)
+
+    def write_initial(self, arrays: Arrays, record: Record) -> None:
+        """The configuration's initial candidate, in the elites' format."""
+        write_elite(self.path, "initial", arrays, record)
+
+    def write_elites(self, elites: Iterable[tuple[Arrays, Record]]) -> None:
+        """All elites, best first; those that were stored beyond their number are removed."""
+        folder = self.path / "elites"
+        make_folder(folder)
+        written = set()
+        for index, (arrays, record) in enumerate(elites):
+            written.add(f"{index:03d}")
+            write_elite(folder, f"{index:03d}", arrays, record)
+        with writing(folder):
+            for name in set(elite_names(self.path)) - written:
+                (folder / f"{name}.json").unlink()
+                (folder / f"{name}.npz").unlink(missing_ok=True)
+
+    def _cut(self, generations: int) -> None:
+        with self._lines_path.open("rb") as file:
+            complete = [len(line) for line in itertools.islice(file, generations) if line.endswith(b"\n")]
+        if len(complete) < generations:
+            raise UserError(
+                f"{self._lines_path} has {len(complete)} complete lines, but {self._state_path} is of generation "
+                f"{generations}: the folder was changed by hand; choose another one"
+            )
+        with writing(self._lines_path):
+            os.truncate(self._lines_path, sum(complete))
+
+
+@contextlib.contextmanager
+def _prepared(path: Path, config: Config) -> Iterator[None]:
+    """The folder, made or recognized, locked and clean."""
+    _require_run_or_nothing(path)
+    make_folder(path)
+    with _locked(path):
+        with writing(path):
+            for leftover in path.rglob(".*.tmp"):
+                leftover.unlink()
+        _claim(path, config)
+        _add_start(path, config)
+        with writing(path):
+            (path / "generations.jsonl").touch()
+        yield
+
+
+def _require_run_or_nothing(path: Path) -> None:
+    if path.exists() and not path.is_dir():
+        raise UserError(f"{path} is a file: a run needs a folder")
+    if not path.exists() or (path / "format.json").is_file():
+        return
+    foreign = sorted(item.name for item in path.iterdir() if item.name != _LOCK and not is_temporary(item))
+    if foreign:
+        raise UserError(f"{path} is no run folder and not empty: it has {', '.join(foreign[:5])}; choose another one")
+
+
+def _claim(path: Path, config: Config) -> None:
+    """Writes format.json and config.yaml, or checks those that are there. format.json first: it marks the folder."""
+    if not (path / "format.json").is_file():
+        replace_json(path / "format.json", {"format": FORMAT, "version": VERSION})
+    require_format(path)
+    if not (path / "config.yaml").is_file():
+        replace(path / "config.yaml", configuration.dump(config).encode())
+    changed = configuration.differences(stored_config(path), config)
+    if changed:
+        keys = [f"  {key}: {old!r} in the folder, {new!r} now" for key, (old, new) in changed.items()]
+        head = f"{path} holds a run with another configuration; choose another folder, or set back"
+        raise UserError("\n".join([head, *keys]))
+
+
+def _add_start(path: Path, config: Config) -> None:
+    file = path / "provenance.json"
+    with reading(file, _FORGET):
+        starts = list(read_json(file, _FORGET)["starts"]) if file.is_file() else []
+    replace_json(file, {"config_hash": configuration.config_hash(config), "starts": [*starts, provenance()]})
+
+
+@contextlib.contextmanager
+def _locked(path: Path) -> Iterator[None]:
+    """Holds the folder for this process; the system frees it when the process ends, however it ends."""
+    with contextlib.ExitStack() as stack:
+        with writing(path):
+            file = stack.enter_context((path / _LOCK).open("a+"))
+            try:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                file.seek(0)
+                holder = file.read().strip() or "another process"
+                raise UserError(f"{path} is in use by {holder}: wait for it or choose another folder") from None
+            file.truncate(0)
+            file.write(f"process {os.getpid()} on {socket.gethostname()}\n")
+            file.flush()
+        yield
+
+
+@contextlib.contextmanager
+def _checkpoints(path: Path) -> Iterator[Any]:
+    """Orbax's checkpointer; closing it waits for its threads, and tells again of a save that failed."""
+    from orbax.checkpoint import v1 as ocp
+
+    kinds = (OSError, ValueError)
+    with writing(path, kinds):
+        checkpointer = ocp.training.Checkpointer(
+            path.absolute(),
+            preservation_policy=ocp.training.preservation_policies.LatestN(KEPT_STATES),
+            cleanup_tmp_directories=True,
+        )
+    try:
+        yield checkpointer
+    finally:
+        with writing(path, kinds):
+            checkpointer.close()
+
+
+def _load(checkpointer: Any, state: State) -> State:
+    import jax
+    import jax.numpy as jnp
+
+    shapes = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=x.sharding), state)
+    latest = checkpointer.latest
+    try:
+        loaded = checkpointer.load(latest.step, shapes)
+    except (KeyError, ValueError, OSError) as error:
+        before = " or remove it, to go on from the state before it;" if len(checkpointer.checkpoints) > 1 else ""
+        raise UserError(
+            f"{latest.path} is no state of this search: it is damaged, or another version or precision wrote it; "
+            f"go on with what provenance.json names,{before} or choose another folder"
+        ) from error
+    # A loaded array is bound to its devices; a fresh one moves to where the evaluations are.
+    return jax.tree.map(lambda x: jnp.asarray(np.asarray(x.addressable_data(0))), loaded)

@@ -1,0 +1,214 @@
+"""A whole run: config -> search -> elites evaluated again -> run folder. Stops and resumes at any generation."""
+
+import math
+import time
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from rtcd_jax.analysis.report import report
+from rtcd_jax.config.load import Config
+from rtcd_jax.elite.records import elite_names
+from rtcd_jax.evaluation import elite_effort, make_evaluate, resample
+from rtcd_jax.genome import initial_genome
+from rtcd_jax.problem import Problem, make_problem
+from rtcd_jax.run.folder import RunFolder
+from rtcd_jax.run.format import arrays_of, record_of
+from rtcd_jax.run.sharding import Spread, spread
+from rtcd_jax.search import search
+from rtcd_jax.search.archive import Elites
+from rtcd_jax.system.cluster import Cluster, Preempted
+from rtcd_jax.system.console import Console, Progress
+from rtcd_jax.system.errors import UserError
+from rtcd_jax.types import Evaluation, Status
+
+LAST_FILE = Path("report.html")
+"""Written when all else is."""
+
+
+def optimize(config: Config, folder: Path, console: Console, cluster: Cluster) -> None:
+    """Search as `config` says and leave everything in the run folder; goes on where an earlier call stopped.
+
+    Raises:
+        UserError: the folder belongs to something else, or nothing at all is feasible.
+        Preempted: the system asked to stop; the folder has all that was done.
+    """
+    problem = make_problem(config)
+    chunk = min(config.search.chunk, -(-config.search.population // len(cluster.devices)))
+    evaluate = spread(make_evaluate(problem), cluster, chunk)
+    plan = search.Plan(config.search, config.elites, tuple(initial_genome(problem).tolist()), problem.design_dims)
+    genomes = jnp.zeros((config.search.population, len(problem.free)))
+    example = jax.eval_shape(make_evaluate(problem), genomes, jax.random.key(0))
+    with RunFolder.open(folder, config, cluster) as run:
+        begun = run.restore(search.start(plan, example))
+        done = int(begun.generation)
+        whole = bool(cluster.agreed(np.asarray((folder / LAST_FILE).is_file())))
+        if done == config.search.generations and whole:
+            console.message(f"{folder} is complete: {done} generations, {len(elite_names(folder))} elites")
+            return
+        if done:
+            console.message(f"{folder}: going on after generation {done}")
+        console.message(
+            f"compiling the evaluation of {config.search.population} candidates on {cluster}: a minute or so"
+        )
+        again = _Again(problem, cluster, example)
+        state, clock = begun, _Clock(config.search.population)
+        try:
+            for state, generation in search.run(plan, evaluate, begun):
+                run.append(vars(generation))
+                run.save_if_due(state, int(state.generation))
+                console.progress(_progress(config, generation, clock))
+                cluster.look(int(state.generation))
+        except Preempted:
+            run.save(state, int(state.generation))
+            raise
+        run.save(state, int(state.generation))
+        last = config.search.generations
+        found = again([*_filled(state.elites), _initial(problem, evaluate)], search.last_key(plan), last + 1, console)
+        finished = search.finish(plan, state, _stacked(found[:-1], state.elites))
+        cluster.on_first(lambda: _store(problem, finished, found[-1], run, console))
+
+
+class _Clock:
+    """Wall time of this process' generations; the first one compiles and says little about the others."""
+
+    def __init__(self, population: int):
+        self.population = population
+        self.begun = time.monotonic()
+        self.ends: list[float] = []
+
+    def tick(self) -> tuple[float, float]:
+        """At a generation's end: seconds since the start; candidates per second, NaN for the first one."""
+        self.ends.append(time.monotonic())
+        later = len(self.ends) - 1
+        rate = later * self.population / (self.ends[-1] - self.ends[0]) if later else math.nan
+        return self.ends[-1] - self.begun, rate
+
+
+def _progress(config: Config, generation: search.Generation, clock: _Clock) -> Progress:
+    elapsed, rate = clock.tick()
+    left = config.search.generations - generation.index - 1
+    return Progress(
+        generation=generation.index + 1,
+        generations=config.search.generations,
+        best=generation.best_so_far,
+        median=generation.median,
+        feasible=generation.feasible,
+        rate=rate,
+        elapsed=elapsed,
+        left=left * config.search.population / rate,
+        failures={name: count for name, count in generation.counts.items() if name != Status.OK.name},
+    )
+
+
+class _Again:
+    """The elites' second evaluation, more thorough: one candidate on every device at a time.
+
+    Its program compiles from the start on, beside the evaluation's own.
+    """
+
+    def __init__(self, problem: Problem, cluster: Cluster, population: Evaluation):
+        self._cluster = cluster
+        pool = ThreadPoolExecutor(1)
+        self._program: Future[jax.stages.Compiled] = pool.submit(self._compile, problem, population)
+        pool.shutdown(wait=False)
+
+    def _compile(self, problem: Problem, population: Evaluation) -> jax.stages.Compiled:
+        def one(evaluation, key):
+            again = resample(problem, elite_effort(problem), _row(evaluation, 0), jax.random.wrap_key_data(key))
+            return jax.tree.map(lambda leaf: leaf[None], again)
+
+        blank = jax.tree.map(lambda leaf: np.zeros(leaf.shape[1:], leaf.dtype), population)
+        key = jax.random.key_data(jax.random.key(0))
+        evaluations, whole = self._split([blank] * len(self._cluster.devices)), self._cluster.replicated(key)
+        return self._cluster.shared(one).lower(evaluations, whole).compile()
+
+    def _split(self, evaluations: Sequence[Evaluation]) -> Evaluation:
+        return self._cluster.split(jax.tree.map(lambda *leaves: np.stack(leaves), *evaluations))
+
+    def __call__(
+        self, evaluations: Sequence[Evaluation], key: jax.Array, step: int, console: Console
+    ) -> list[Evaluation]:
+        """Each with its funnel sampled again. Raises Preempted between two rounds, the first look being at `step`."""
+        devices, whole = len(self._cluster.devices), self._cluster.replicated(jax.random.key_data(key))
+        found: list[Evaluation] = []
+        for begin in range(0, len(evaluations), devices):
+            self._cluster.look(step + begin)
+            batch = [*evaluations[begin : begin + devices]]
+            batch += batch[-1:] * (devices - len(batch))
+            sampled = self._cluster.gathered(self._program.result()(self._split(batch), whole))
+            found += [_row(sampled, k) for k in range(devices)]
+            done = min(len(found), len(evaluations))
+            console.message(f"funnel sampled again: {done} of {len(evaluations)}")
+        return found[: len(evaluations)]
+
+
+def _filled(elites: Elites) -> list[Evaluation]:
+    records = jax.device_get(elites.evaluation)
+    return [_row(records, k) for k in range(int(elites.count))]
+
+
+def _stacked(evaluations: list[Evaluation], elites: Elites) -> Evaluation:
+    """As many records as the archive has slots; what stands in the empty ones does not matter."""
+    rows = [*evaluations, *evaluations[-1:] * (len(elites.costs) - len(evaluations))]
+    return jax.tree.map(lambda *leaves: np.stack(leaves), *rows)
+
+
+def _initial(problem: Problem, evaluate: Callable[..., Spread]) -> Evaluation:
+    genome = np.asarray(initial_genome(problem))
+    return _row(evaluate(genome[None], jax.random.key(0)).take(np.array([0])), 0)
+
+
+def _store(problem: Problem, elites: Elites, initial: Evaluation, run: RunFolder, console: Console) -> None:
+    """Elites, initial candidate and figures in the run folder, a summary on the console."""
+    best_first = _filled(elites)
+    if not best_first:
+        raise UserError(
+            "none of the elites kept a funnel under more samples: raise funnel.directions or funnel.trials, "
+            "so that the search is not misled by luck"
+        )
+    effort = elite_effort(problem)
+    run.write_initial(arrays_of(problem, initial), record_of(problem, effort, initial))
+    run.write_elites((arrays_of(problem, found), record_of(problem, effort, found)) for found in best_first)
+    run.tell_time()
+    for line in _summary(problem, initial, best_first[0]):
+        console.message(line)
+    console.message(f"{len(best_first)} elites in {run.path}")
+    _report(run.path, console)
+
+
+def _report(folder: Path, console: Console) -> None:
+    """The run's page and figures. The run is whole without them: what goes wrong here is told, and ends nothing."""
+    try:
+        page, *figures = report([folder])
+    except Exception as error:
+        console.message(f"the run is finished, but its report failed: {error!r}; `rtcd report {folder}` makes it")
+    else:
+        console.message(f"{page}, and {len(figures)} figures in {figures[0].parent}")
+
+
+def _row(evaluation: Evaluation, index: int) -> Evaluation:
+    return jax.tree.map(lambda leaf: leaf[index], evaluation)
+
+
+def _summary(problem: Problem, initial: Evaluation, best: Evaluation) -> Iterator[str]:
+    """The volumes of the initial and the best candidate with their ratios, and what the best one is."""
+    yield f"{'volume (sampled)':20}{'initial':>12}{'best':>12}{'ratio':>9}"
+    for label, name in (("sum", "total"), *((name,) * 2 for name in ("integral", "inlet", "geometric_mean"))):
+        before, after = float(getattr(initial.volumes, name)), float(getattr(best.volumes, name))
+        ratio = f"{after / before:9.2f}" if before > 0 else f"{'-':>9}"
+        yield f"{label:20}{before:12.5g}{after:12.5g}{ratio}"
+    if int(initial.status) != Status.OK:
+        yield f"the initial candidate has no funnel: {Status(int(initial.status)).message}"
+    design = ", ".join(
+        f"{name} {float(getattr(best.candidate.design, name)):.4g} {unit}"
+        for name, unit in problem.plant.design_units.items()
+    )
+    weights = ", ".join(f"{value:.4g}" for value in (*best.candidate.q.tolist(), *best.candidate.r.tolist()))
+    options = {"authority": best.candidate.authority, "discount": best.candidate.discount}
+    searched = "".join(f"; {name} {float(value):.4g}" for name, value in options.items() if value is not None)
+    yield f"best: {design}; diagonals of Q and R: {weights}{searched}"

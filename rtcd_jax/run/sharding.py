@@ -1,0 +1,96 @@
+"""A population over the devices of a cluster, chunk by chunk.
+
+Every device evaluates chunks of one size by one program, whatever their number: where a candidate was evaluated, and
+beside how many others, does not show in its result, down to the last bit on devices of one kind.
+"""
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any, cast, final
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int, Key
+
+from rtcd_jax.evaluation import Evaluate
+from rtcd_jax.system.cluster import Cluster
+from rtcd_jax.types import Evaluation, Volumes
+
+POLL = 0.01
+"""Seconds between two looks at whether a chunk is done."""
+
+
+@final
+@dataclass(frozen=True)
+class Spread:
+    """A population's evaluation. The numbers that a search looks at are at hand, volumes but for those of the knots;
+    whole records stay on the devices until they are taken."""
+
+    genome: Float[np.ndarray, "P d"]
+    status: Int[np.ndarray, " P"]
+    volumes: Volumes
+    _parts: tuple[Evaluation, ...]
+    _fetch: Callable[[Evaluation, np.ndarray], Evaluation]
+
+    def take(self, rows: Int[np.ndarray, " E"]) -> Evaluation:
+        """The whole records [E] of these candidates, in numpy."""
+        size = self._parts[0].status.shape[0]
+        first, *others = np.unique(rows // size)
+        found = self._fetch(self._parts[first], rows % size)
+        for index in others:
+            part = self._fetch(self._parts[index], rows % size)
+            found = jax.tree.map(partial(_where, rows // size == index), part, found)
+        return found
+
+
+def spread(evaluate: Evaluate, cluster: Cluster, chunk: int) -> Callable[[Float[np.ndarray, "P d"], Key], Spread]:
+    """`evaluate` for populations of any size, `chunk` candidates on every device of the cluster at a time.
+
+    The genomes are process 0's. The last chunks are filled up with copies of the last genome. Between chunks the
+    cluster looks whether it was asked to stop, and raises Preempted.
+    """
+    size = chunk * len(cluster.devices)
+    on_devices = cluster.shared(lambda genomes, key: evaluate(genomes, jax.random.wrap_key_data(key)))
+    fetch = partial(_fetch, cluster, cluster.shared(partial(_rows, chunk)), chunk)
+
+    def evaluate_all(genomes: Float[np.ndarray, "P d"], key: Key[Array, ""]) -> Spread:
+        genomes = cluster.agreed(np.asarray(genomes))
+        count = len(genomes)
+        padded = np.concatenate([genomes, np.repeat(genomes[-1:], -count % size, 0)])
+        whole = cluster.replicated(jax.random.key_data(key))
+        parts = [on_devices(cluster.split(part), whole) for part in np.split(padded, len(padded) // size)]
+        seen = [_seen(cluster, part) for part in parts]
+        status, volumes = jax.tree.map(lambda *leaves: np.concatenate(leaves)[:count], *seen)
+        return Spread(genomes, status, volumes, tuple(parts), fetch)
+
+    return evaluate_all
+
+
+def _seen(cluster: Cluster, part: Evaluation) -> tuple[np.ndarray, Volumes]:
+    done = cast(Any, part.status).is_ready
+    while not done():
+        time.sleep(POLL)
+    cluster.look()
+    return cluster.gathered((part.status, replace(part.volumes, per_knot=part.volumes.per_knot[:, :0])))
+
+
+def _rows(chunk: int, part: Evaluation, wanted: Int[Array, " E"]) -> Evaluation:
+    """On one device: its own candidates among the wanted ones, anything for the others."""
+    inside = jnp.clip(wanted - chunk * jax.lax.axis_index("candidates"), 0, chunk - 1)
+    return jax.tree.map(lambda leaf: leaf[inside], part)
+
+
+def _fetch(cluster: Cluster, rows: Callable, chunk: int, part: Evaluation, wanted: Int[np.ndarray, " E"]) -> Evaluation:
+    """The wanted records of a part, whose device is known by their place."""
+    found = cluster.gathered(rows(part, cluster.replicated(wanted)))
+    devices, count = len(cluster.devices), len(wanted)
+    return jax.tree.map(
+        lambda leaf: leaf.reshape(devices, count, *leaf.shape[1:])[wanted // chunk, np.arange(count)], found
+    )
+
+
+def _where(here: np.ndarray, new: np.ndarray, old: np.ndarray) -> np.ndarray:
+    return np.where(here.reshape(-1, *(1,) * (new.ndim - 1)), new, old)

@@ -1,0 +1,250 @@
+"""ask -> evaluate -> tell -> elites, one generation at a time; no files, no clock, no devices.
+
+The search sees its problem through one deterministic function alone:
+
+    evaluate(genomes [P, d], key) -> Evaluated      a population in the unit box, `key` its common random numbers
+
+At its end the elites are evaluated once more, with more samples and fresh directions; `finish` sorts them by that.
+
+All randomness of a generation is fold_in(key(seed), index): the same state always has the same next state.
+"""
+
+import dataclasses
+import functools
+from collections.abc import Callable, Iterator
+from typing import NamedTuple, Self, final
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int, Key
+
+from rtcd_jax.config.schema import ElitesConfig, SearchConfig
+from rtcd_jax.search import archive as elites
+from rtcd_jax.search import cmaes
+from rtcd_jax.search.archive import Elites, Evaluated
+from rtcd_jax.search.cmaes import Stop
+from rtcd_jax.search.nesting import Joint, Nested, NestedState
+from rtcd_jax.system.errors import UserError
+from rtcd_jax.types import Evaluation, Status
+
+Evaluate = Callable[[Float[Array, "P d"], Key[Array, ""]], Evaluated]
+
+# Generations after which a search without any feasible candidate is given up.
+PATIENCE = 10
+
+
+class NothingFeasible(UserError):
+    """Not one candidate so far has a funnel; `counts` says how many failed for which reason."""
+
+    def __init__(self, counts: dict[Status, int], generations: int):
+        self.counts = counts
+        reasons = [f"  {count} {status.name}: {status.message}" for status, count in counts.items() if count]
+        head = f"nothing is feasible: none of {sum(counts.values())} candidates in {generations} generations"
+        super().__init__("\n".join([head, *reasons]))
+
+
+@final
+@dataclasses.dataclass(frozen=True)
+class Plan:
+    """What is fixed during a search. `initial` is the first genome, `design` tells its design entries from weights.
+
+    Raises ValueError if the initial genome is empty or outside the unit box, or if nested loops lack a design
+    variable or a weight.
+    """
+
+    settings: SearchConfig
+    elites: ElitesConfig
+    initial: tuple[float, ...]
+    design: tuple[bool, ...]
+
+    def __post_init__(self):
+        if len(self.design) != len(self.initial):
+            raise ValueError(f"design has {len(self.design)} flags for {len(self.initial)} free variables")
+        outside = [f"{i}: {value}" for i, value in enumerate(self.initial) if not 0 <= value <= 1]
+        if outside:
+            raise ValueError(f"the initial genome leaves the unit box [0, 1] at {', '.join(outside)}")
+        _loop(self)  # refuses what cannot be searched, before anything is evaluated
+
+
+@final
+class SearchState(eqx.Module):
+    """All that a search must remember between two generations.
+
+    `generation` and `evaluations` count what is done; `counts` [len(Status)] are the candidates by status so far,
+    `restarts` those of all loops.
+    """
+
+    strategy: cmaes.State | NestedState
+    elites: Elites
+    generation: Int[Array, ""]
+    evaluations: Int[Array, ""]
+    restarts: Int[Array, ""]
+    counts: Int[Array, " statuses"]
+
+
+@final
+@dataclasses.dataclass(frozen=True)
+class Generation:
+    """What one generation found, on the host; volumes are NaN where a candidate failed.
+
+    `volumes` are [P] each by the objectives' names; `best` and `median` (over the feasible) are those of `objective`
+    in this generation, `best_so_far` that of the archive (all sampled rung); `feasible` is a share, `counts` and
+    `stops` leave out what did not occur; `sigma` is the (outer) step size [box widths], `evaluations` and `restarts`
+    count from the search's start.
+    """
+
+    index: int
+    evaluations: int
+    objective: str
+    best: float
+    median: float
+    best_so_far: float
+    feasible: float
+    counts: dict[str, int]
+    sigma: float
+    restarts: int
+    stops: dict[str, int]
+    genomes: np.ndarray
+    statuses: np.ndarray
+    volumes: dict[str, np.ndarray]
+
+
+def start(plan: Plan, example: Evaluation) -> SearchState:
+    """The state before generation 0. `example` is an evaluated population of any size, or its shapes."""
+    zero = jnp.zeros((), jnp.int32)
+    return SearchState(
+        strategy=_loop(plan).start(),
+        elites=elites.empty(plan.elites.count, example),
+        generation=zero,
+        evaluations=zero,
+        restarts=zero,
+        counts=jnp.zeros(len(Status), jnp.int32),
+    )
+
+
+def step(plan: Plan, evaluate: Evaluate, state: SearchState) -> tuple[SearchState, Generation]:
+    """One generation: P candidates asked for, evaluated, told, and merged into the elites."""
+    draw, directions, anew = jax.random.split(_key(plan, state.generation), 3)
+    strategy, points, genomes = _ask(plan, state.strategy, draw)
+    evaluation = evaluate(genomes, directions)
+    seen = _Seen.of(evaluation, plan.settings.objective)
+    strategy, stops = _tell(plan, strategy, points, seen.costs, anew)
+    after = SearchState(
+        strategy=strategy,
+        elites=elites.merge(
+            state.elites, evaluation, plan.settings.objective, int(state.generation), plan.elites.distance
+        ),
+        generation=state.generation + 1,
+        evaluations=state.evaluations + len(seen.costs),
+        restarts=state.restarts + jnp.sum(stops != Stop.NONE, dtype=jnp.int32),
+        counts=state.counts + np.bincount(seen.statuses, minlength=len(Status)).astype(np.int32),
+    )
+    return after, _record(plan, after, seen, np.asarray(stops))
+
+
+def run(plan: Plan, evaluate: Evaluate, state: SearchState) -> Iterator[tuple[SearchState, Generation]]:
+    """The generations that are left from `state` on, each with the state after it.
+
+    Raises NothingFeasible once `PATIENCE` generations (or all, if fewer) have passed without any feasible candidate.
+    """
+    total = plan.settings.generations
+    while True:
+        done = int(state.generation)
+        if done >= min(PATIENCE, total) and not int(state.elites.count):
+            raise NothingFeasible({status: int(state.counts[status]) for status in Status}, done)
+        if done >= total:
+            return
+        state, generation = step(plan, evaluate, state)
+        yield state, generation
+
+
+def last_key(plan: Plan) -> Key[Array, ""]:
+    """The random numbers of the elites' second evaluation."""
+    return _key(plan, plan.settings.generations)
+
+
+def finish(plan: Plan, state: SearchState, evaluation: Evaluation) -> Elites:
+    """The elites by their second `evaluation` [E], slot by slot, sorted anew; those that failed it are dropped.
+
+    A sampled volume that won among thousands is likely to have been lucky: only the second one may be reported.
+    """
+    first = state.elites
+    status = jnp.where(jnp.isfinite(first.costs), evaluation.status, jnp.int32(Status.NOT_FINITE))
+    evaluation = eqx.tree_at(lambda e: e.status, evaluation, status)
+    none = elites.empty(plan.elites.count, evaluation)
+    return elites.merge(none, evaluation, plan.settings.objective, first.generations, 0.0)
+
+
+def _loop(plan: Plan) -> Joint | Nested:
+    settings = plan.settings
+    if settings.mode == "joint":
+        strategy = cmaes.Strategy(len(plan.initial), settings.population, settings.sigma)
+        return Joint(strategy, plan.initial)
+    return Nested.plan(
+        population=settings.population,
+        designs=settings.nested.designs,
+        generations=settings.nested.generations,
+        sigma=settings.sigma,
+        initial=plan.initial,
+        design=plan.design,
+    )
+
+
+def _key(plan: Plan, generation: Int[Array, ""] | int) -> Key[Array, ""]:
+    return jax.random.fold_in(jax.random.key(plan.settings.seed), generation)
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def _ask(plan: Plan, strategy: cmaes.State | NestedState, key: Key[Array, ""]):
+    return _loop(plan).ask(strategy, key)
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def _tell(plan: Plan, strategy: cmaes.State | NestedState, points, costs: Float[Array, " P"], key: Key[Array, ""]):
+    return _loop(plan).tell(strategy, points, costs, key)
+
+
+@final
+class _Seen(NamedTuple):
+    """The numbers of a population's evaluation that the search itself looks at, on the host."""
+
+    genomes: np.ndarray
+    statuses: np.ndarray
+    costs: np.ndarray
+    volumes: dict[str, np.ndarray]
+
+    @classmethod
+    def of(cls, evaluation: Evaluated, objective: str) -> Self:
+        volumes = {name: elites.volume(evaluation.volumes, name) for name in elites.OBJECTIVES}
+        costs = elites.cost(evaluation, objective)
+        seen = jax.device_get(cls(evaluation.genome, evaluation.status, costs, volumes))
+        feasible = np.isfinite(seen.costs)
+        return seen._replace(volumes={name: np.where(feasible, v, np.nan) for name, v in seen.volumes.items()})
+
+
+def _record(plan: Plan, after: SearchState, seen: _Seen, stops: np.ndarray) -> Generation:
+    objective = plan.settings.objective
+    feasible = np.isfinite(seen.costs)
+    found = seen.volumes[objective][feasible]
+    return Generation(
+        index=int(after.generation) - 1,
+        evaluations=int(after.evaluations),
+        objective=objective,
+        best=float(found.max()) if found.size else float("nan"),
+        median=float(np.median(found)) if found.size else float("nan"),
+        best_so_far=_best_so_far(after.elites, objective),
+        feasible=float(feasible.mean()),
+        counts={status.name: n for status in Status if (n := int(np.sum(seen.statuses == status)))},
+        sigma=float(_loop(plan).sigma(after.strategy)),
+        restarts=int(after.restarts),
+        stops={reason.name: n for reason in Stop if reason and (n := int(np.sum(stops == reason)))},
+        genomes=seen.genomes,
+        statuses=seen.statuses,
+        volumes=seen.volumes,
+    )
+
+
+def _best_so_far(found: Elites, objective: str) -> float:
+    return float(elites.volume(found.evaluation.volumes, objective)[0]) if int(found.count) else float("nan")

@@ -1,0 +1,104 @@
+"""Files that are replaced as a whole, and whose errors name them."""
+
+import contextlib
+import errno
+import json
+import math
+import os
+import zipfile
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+from rtcd_jax.system.errors import UserError
+
+
+def plain(value: Any) -> Any:
+    """`value` in JSON's own types, arrays as lists; None where a number is not finite."""
+    if isinstance(value, Mapping):
+        return {str(key): plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [plain(item) for item in value]
+    if hasattr(value, "tolist"):
+        import numpy as np
+
+        return value.tolist() if np.all(np.isfinite(value)) else plain(value.tolist())
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    if value is None or isinstance(value, str | int):
+        return value
+    raise TypeError(f"JSON has no {type(value).__name__}: {value!r}")
+
+
+def make_folder(path: Path) -> None:
+    """Makes a folder, with its parents, where it is not there. Raises `UserError` if nothing can be written into it."""
+    with writing(path):
+        path.mkdir(parents=True, exist_ok=True)
+        if not os.access(path, os.W_OK):  # known before the work, not after it
+            raise PermissionError(errno.EACCES, "it is read-only")
+
+
+def replace_json(path: Path, record: Mapping[str, Any]) -> None:
+    """`replace` by JSON that a human can read, with null for what is not finite."""
+    text = json.dumps(plain(record), indent=2, allow_nan=False, ensure_ascii=False)
+    replace(path, f"{text}\n".encode())
+
+
+def replace(path: Path, content: bytes) -> None:
+    """The old file or the new one, never a part, whenever the process or the machine stops."""
+    temporary = path.with_name(f".{path.name}.tmp")
+    with writing(path):
+        with temporary.open("wb") as file:
+            file.write(content)
+            file.flush()
+            os.fsync(file.fileno())
+        temporary.replace(path)
+    sync(path.parent)
+
+
+def sync(path: Path) -> None:
+    """Waits until a file, or a folder's list of files, is on disk."""
+    with writing(path):
+        descriptor = os.open(path, os.O_RDONLY)
+        try:
+            os.fsync(descriptor)
+        finally:
+            os.close(descriptor)
+
+
+def read_json(path: Path, advice: str) -> dict[str, Any]:
+    """The object in a JSON file. Raises `UserError` as `reading` does."""
+    with reading(path, advice):
+        found = json.loads(path.read_text(encoding="utf-8"))
+        if not isinstance(found, dict):
+            raise TypeError(f"must be a JSON object, is {found!r:.40}")
+        return found
+
+
+@contextlib.contextmanager
+def reading(path: Path, advice: str) -> Iterator[None]:
+    """Turns what a damaged file raises into one error that names it and ends with `advice`."""
+    try:
+        yield
+    except UserError:
+        raise
+    except (OSError, EOFError, KeyError, TypeError, ValueError, zipfile.BadZipFile) as error:
+        lacks = "it lacks " if isinstance(error, KeyError) else ""
+        told = getattr(error, "strerror", None) or lacks + " ".join(str(error).split()) or type(error).__name__
+        raise UserError(f"cannot read {path}: {told}; {advice}") from error
+
+
+@contextlib.contextmanager
+def writing(path: Path, kinds: tuple[type[Exception], ...] = (OSError,)) -> Iterator[None]:
+    """Turns the system's errors into one that names the path and can be shown as it is."""
+    try:
+        yield
+    except UserError:
+        raise
+    except kinds as error:
+        raise UserError(f"cannot write {path}: {getattr(error, 'strerror', None) or error}") from error
+
+
+def is_temporary(path: Path) -> bool:
+    """True for what `replace` leaves behind if it is killed."""
+    return path.name.startswith(".") and path.suffix == ".tmp"

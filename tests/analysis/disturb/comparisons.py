@@ -1,0 +1,19 @@
+"""Two loops of one robot into the upright, to be disturbed."""
+
+import dataclasses
+
+from rtcd_jax.analysis.disturb.comparison import contest_of
+from rtcd_jax.elite.elite import Elite
+from rtcd_jax.elite.records import read_elite
+from tests.export.folders import run_folder
+
+
+def elite_of(path, plant):
+    """The elite of a fresh run folder at `path`."""
+    return Elite.of(*read_elite(run_folder(path, plant) / "elites", "000"))
+
+
+def contest(path, plant):
+    """An elite as the initial one, and as the best one the same with gains that are a tenth larger."""
+    elite = elite_of(path, plant)
+    return contest_of({"initial": elite, "best": dataclasses.replace(elite, K=1.1 * elite.K)}, "0123456789ab")

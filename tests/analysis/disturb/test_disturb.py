@@ -1,0 +1,151 @@
+"""`rtcd disturb` on a run folder: records and figures, deterministic by seed, and clear refusals."""
+
+import json
+import shutil
+
+import numpy as np
+import pytest
+
+from rtcd_jax.analysis import disturb
+from rtcd_jax.analysis.disturb import comparison as contests
+from rtcd_jax.analysis.disturb import disturb_run, experiments
+from rtcd_jax.analysis.disturb.comparison import Progress, motions, read_contest, run
+from rtcd_jax.analysis.disturb.experiments import SCORED
+from rtcd_jax.analysis.disturb.scenarios import undisturbed
+from rtcd_jax.elite.closed_loop import runge_kutta, simulate
+from rtcd_jax.elite.records import read_elite, write_elite
+from rtcd_jax.elite.simulators import witnesses
+from rtcd_jax.system.errors import UserError
+from tests.export.folders import run_folder
+
+NAMES = ("off_nominal", "impulse", "robustness")
+
+
+class Remembering:
+    """A console that keeps what it is told."""
+
+    def __init__(self):
+        self.lines, self.progressed = [], []
+
+    def message(self, text):
+        self.lines.append(text)
+
+    def progress(self, now):
+        self.progressed.append(now)
+
+
+class NoMeter:
+    """A meter that nobody reads."""
+
+    def tick(self, experiment, motions):
+        pass
+
+
+SMALL = {
+    experiments: {"FACTORS": (1, 4), "TIMES": 5, "SIZES": 7, "LEVELS": 5, "REPEATS": 2, "PROFILES": 6},
+    disturb: {"FACTORS": (1, 4), "TIMES": 5, "SIZES": 7},
+    contests: {"BATCH": 256},
+}
+
+
+@pytest.fixture(scope="module", autouse=True)
+def small():
+    """Experiments that take a second."""
+    with pytest.MonkeyPatch.context() as patch:
+        for module, values in SMALL.items():
+            for name, value in values.items():
+                patch.setattr(module, name, value)
+        yield
+
+
+@pytest.fixture(scope="module")
+def disturbed(small, tmp_path_factory):
+    """A disturbed run folder, what it said, and the bytes of its records."""
+    folder = run_folder(tmp_path_factory.mktemp("disturbed") / "run", "pendulum")
+    console = Remembering()
+    disturb_run(folder, 30, 5, console)
+    return folder, console, {name: (folder / "disturbance" / f"{name}.json").read_bytes() for name in NAMES}
+
+
+def test_every_experiment_leaves_its_record_and_its_figures(disturbed):
+    folder, console, records = disturbed
+    for name, content in records.items():
+        record = json.loads(content)
+        assert record["plant"] == "pendulum"
+        assert record["config_hash"] == "0123456789ab"
+        assert all(isinstance(row, dict) for row in record["summary"].values())
+        for suffix in ("png", "pdf"):
+            assert (folder / "disturbance" / f"{name}.{suffix}").stat().st_size > 1000
+    robust = json.loads(records["robustness"])["summary"]
+    for criteria in robust.values():
+        assert criteria["score"] == pytest.approx(np.mean([criteria[name] for name in SCORED]))
+    text = "\n".join(console.lines)
+    for words in ("best ellipsoid x 1", "recovered", "score", "control rate", "3 records and 6 figures"):
+        assert words in text
+
+
+def test_the_same_seed_gives_the_same_records_and_another_one_others(disturbed, tmp_path):
+    folder, _, records = disturbed
+    copy = shutil.copytree(folder, tmp_path / "copy")
+    disturb_run(copy, 30, 5, Remembering())
+    for name, content in records.items():
+        assert (copy / "disturbance" / f"{name}.json").read_bytes() == content
+    read = json.loads(records["off_nominal"])
+    assert read["seed"] == 5
+    assert read["states"] == 30
+    assert read["factors"] == [1, 4]
+
+
+def test_verdicts_are_the_verifications(tmp_path):
+    """Uniform states of the first ellipsoid, and others twelve times as far: arrived or not, state by state."""
+    folder = run_folder(tmp_path / "run", "pendulum")
+    contest = read_contest(folder, Remembering())
+    elite = contest.elites[1]
+    x = elite.points(np.zeros(60, int), np.random.default_rng(0))
+    x[::2] = elite.x[0] + 3 * (x[::2] - elite.x[0])
+    lanes = undisturbed(contest.plant, contest.design, np.ones(60, int), x.T)
+    found = run(contest, lanes, 0, "", NoMeter(), settles=True)
+    witness = next(witnesses(elite, 60))
+    seen = simulate(elite, witness.dynamics, runge_kutta(witness.dynamics, 2e-3), np.zeros(60, int), x)
+    lost = found.left_limits | ~(found.final <= 1e-3)
+    assert 0 < lost.sum() < 60
+    np.testing.assert_array_equal(lost, seen.left_limits | seen.missed_goal)
+
+
+def test_a_batch_that_may_end_early_gives_the_verdicts_of_one_that_may_not(pendulums):
+    elite = pendulums.elites[0]
+    x = elite.points(np.zeros(40, int), np.random.default_rng(2))
+    lanes = undisturbed(pendulums.plant, pendulums.design, np.zeros(40, int), x.T)
+    early, late = (run(pendulums, lanes, 0, "", NoMeter(), settles) for settles in (True, False))
+    np.testing.assert_array_equal(early.left_limits, late.left_limits)
+    np.testing.assert_array_equal(early.final <= 1e-3, late.final <= 1e-3)
+    assert np.all(late.final[~late.left_limits] <= late.held[~late.left_limits])
+
+
+def test_batches_are_full_and_outcomes_are_as_many_as_lanes(pendulums):
+    assert [motions(count) for count in (1, 256, 257)] == [256, 256, 512]
+    x = np.tile(pendulums.elites[0].x[0], (259, 1))
+    lanes = undisturbed(pendulums.plant, pendulums.design, np.zeros(259, int), x.T)
+    outcome = run(pendulums, lanes, 0, "", NoMeter(), settles=True)
+    assert outcome.final.shape == (259,)
+    np.testing.assert_array_equal(outcome.final, outcome.final[0])
+
+
+def test_an_initial_candidate_without_a_funnel_is_left_out(tmp_path):
+    folder = run_folder(tmp_path / "run", "pendulum")
+    arrays, record = read_elite(folder, "initial")
+    write_elite(folder, "initial", arrays, record | {"status": "FUNNEL_EMPTY"})
+    console = Remembering()
+    assert read_contest(folder, console).names == ("best",)
+    assert console.lines == ["initial: left out, it has no funnel (FUNNEL_EMPTY)"]
+
+
+def test_a_run_without_elites_is_refused(tmp_path):
+    (tmp_path / "format.json").touch()
+    with pytest.raises(UserError, match="has no elites yet: finish the run first"):
+        disturb_run(tmp_path, 10, 0, Remembering())
+
+
+def test_progress_says_what_is_left():
+    assert str(Progress(250, 1000, "impulse", 10.0)) == "impulse       25%  elapsed 10 s  left 30 s"
+    assert "left" not in str(Progress(5, 1000, "impulse", 10.0))

@@ -1,0 +1,178 @@
+"""A motion that is inside all the way is told so, another one where it left; both sides of the level."""
+
+import csv
+import json
+
+import numpy as np
+import pytest
+
+from rtcd_jax.analysis.replay.measured import columns_of, jumps, read_measured
+from rtcd_jax.analysis.replay.replay import replay_run
+from rtcd_jax.elite.funnel import Tube
+from rtcd_jax.elite.records import write_elite
+from rtcd_jax.system.errors import UserError
+from tests.analysis.report.loops import LOOPS, loop_folder, stored
+
+HEADS = {"pendulum": "time,pos,vel,torque", "cartpole": "time,pos1,pos2,vel1,vel2,tau1,tau2"}
+
+
+class Said:
+    def __init__(self):
+        self.lines = []
+
+    def message(self, text):
+        self.lines.append(text)
+
+
+def motion(plant, scale, samples=41, after=0.05):
+    """Times beyond the last knot, and states at sqrt(V/rho) = scale(t) along a fixed direction."""
+    arrays, record = stored(plant)
+    tube = Tube.of(arrays, record)
+    time = np.linspace(0, arrays["time"][-1] + after, samples)
+    direction = np.ones(arrays["x"].shape[1])
+    lengths = np.sqrt(tube.level(time) / np.einsum("i,tij,j->t", direction, tube.value(time), direction))
+    return time, tube.nominal(time) + (scale(time) * lengths)[:, None] * direction
+
+
+def measured_file(path, plant, time, x):
+    torques = np.zeros((len(time), x.shape[1] // 2))
+    rows = np.column_stack([time, x, torques]).tolist()
+    path.write_text("\n".join([HEADS[plant], *(",".join(map(repr, row)) for row in rows)]))
+    return path
+
+
+@pytest.fixture(params=LOOPS)
+def plant(request):
+    return request.param
+
+
+def test_a_motion_inside_all_the_way_is_told_its_smallest_margin(tmp_path, plant, figures):
+    folder = loop_folder(tmp_path / "run", plant)
+    time, x = motion(plant, lambda t: 0.5 + 0.4 * np.exp(-(((t - 0.02) / 0.01) ** 2)))
+    said = Said()
+    assert replay_run(folder, measured_file(tmp_path / "lab.csv", plant, time, x), 0, said)
+    told = json.loads((folder / "replay" / "lab_000.json").read_text())
+    fill = (0.5 + 0.4 * np.exp(-(((time - 0.02) / 0.01) ** 2))) ** 2
+    assert told["inside"]
+    assert told["first_exit"] is None
+    assert told["smallest_margin"] == pytest.approx(1 - fill.max())
+    assert told["closest"]["time"] == time[fill.argmax()]
+    with (folder / "replay" / "lab_000.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    np.testing.assert_allclose([float(row["V/rho"]) for row in rows], fill)
+    assert {row["inside"] for row in rows} == {"1"}
+    assert any("inside the funnel all the way" in line for line in said.lines)
+
+
+def test_the_initial_candidate_s_funnel_is_its_own(tmp_path, figures):
+    folder = loop_folder(tmp_path / "run", "pendulum")
+    arrays, record = stored("pendulum")
+    write_elite(folder, "initial", arrays | {"rho": arrays["rho"] / 4}, record)
+    path = measured_file(tmp_path / "lab.csv", "pendulum", *motion("pendulum", lambda t: np.full_like(t, 0.7)))
+    assert replay_run(folder, path, 0, Said())
+    assert not replay_run(folder, path, "initial", Said())
+    told = json.loads((folder / "replay" / "lab_initial.json").read_text())
+    assert told["first_exit"]["V/rho"] == pytest.approx(4 * 0.49)
+    assert json.loads((folder / "replay" / "lab_000.json").read_text())["inside"]
+
+
+@pytest.mark.parametrize(("peak", "kept"), [(0.999, True), (1.001, False)])
+def test_the_level_divides_inside_from_outside(tmp_path, plant, figures, peak, kept):
+    folder = loop_folder(tmp_path / "run", plant)
+    time, x = motion(plant, lambda t: np.full_like(t, peak))
+    assert replay_run(folder, measured_file(tmp_path / "lab.csv", plant, time, x), 0, Said()) is kept
+
+
+def test_the_first_exit_is_told_with_time_fill_and_state(tmp_path, plant, figures):
+    folder = loop_folder(tmp_path / "run", plant)
+    time, x = motion(plant, lambda t: np.where(t < 0.03, 0.5, np.where(t < 0.035, 3.0, 1.5)))
+    said = Said()
+    assert not replay_run(folder, measured_file(tmp_path / "lab.csv", plant, time, x), 0, said)
+    told = json.loads((folder / "replay" / "lab_000.json").read_text())
+    first = int(np.argmax(time >= 0.03))
+    assert told["first_exit"]["time"] == time[first]
+    assert told["first_exit"]["V/rho"] == pytest.approx(9.0)
+    assert list(told["first_exit"]["state"].values()) == pytest.approx(x[first].tolist())
+    assert told["share_inside"] == pytest.approx(first / len(time))
+    assert any(
+        line.startswith(f"OUTSIDE the funnel, first at t = {time[first]:.4g} s: V/rho = 9") for line in said.lines
+    )
+
+
+def test_the_figure_shows_what_was_measured_and_marks_what_was_outside(tmp_path, figures):
+    folder = loop_folder(tmp_path / "run", "cartpole")
+    time, x = motion("cartpole", lambda t: np.where(t < 0.03, 0.5, 2.0))
+    replay_run(folder, measured_file(tmp_path / "lab.csv", "cartpole", time, x), 0, Said())
+    *panels, fill = figures[0].axes
+    assert len(panels) == 2
+    for axes, plane in zip(panels, [(0, 2), (1, 3)], strict=True):
+        (line,) = [line for line in axes.lines if line.get_label() == "measured"]
+        np.testing.assert_allclose(line.get_xydata(), x[:, plane])
+        (outside,) = [line for line in axes.lines if line.get_label() == "outside"]
+        np.testing.assert_allclose(outside.get_xydata(), x[time >= 0.03][:, plane])
+    np.testing.assert_allclose(fill.lines[0].get_ydata(), np.where(time < 0.03, 0.25, 4.0))
+
+
+def test_columns_are_found_by_name_in_any_order_and_others_are_not_looked_at(tmp_path):
+    path = tmp_path / "lab.csv"
+    path.write_text("\ufeffvel, pos ,note,time\n1,2,x,0\n\n3,4,,0.5\n", encoding="utf-8")
+    found = read_measured(path, 2)
+    np.testing.assert_array_equal(found.time, [0, 0.5])
+    np.testing.assert_array_equal(found.x, [[2, 1], [4, 3]])
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (None, "no such file; must be a CSV"),
+        ("", "is empty: must begin with the columns' names"),
+        ("time,pos,vel,torque\n", "has no samples"),
+        ("time,pos,torque\n0,0,0\n", "lacks the column vel: must have time,pos,vel,torque"),
+        ("t,p\n0,0\n", "lacks the columns time, pos, vel: must have"),
+        ("time,pos,vel\n0,0,0\n1,nan,0\n", "line 3: pos = 'nan': must be a finite number"),
+        ("time,pos,vel\n0,0,0\n\n1,x,0\n", "line 4: pos = 'x': must be a finite number"),
+        ("time,pos,vel\n0,0\n", "line 2: vel = '': must be a finite number"),
+        ("time,pos,vel\n0,0,0\n1,0,0\n1,0,0\n", "line 4: time = 1 after 1: must rise"),
+        ("time,pos,vel\n-1,0,0\n1,0,0\n", r"time begins at -1 s: must begin in \[0, 0.2\)"),
+        ("time,pos,vel\n1000,0,0\n1001,0,0\n", r"time begins at 1000 s: must begin in \[0, 0.2\)"),
+    ],
+)
+def test_what_is_no_measured_motion_is_refused(tmp_path, text, message):
+    folder, path = loop_folder(tmp_path / "run", "pendulum"), tmp_path / "lab.csv"
+    if text is not None:
+        path.write_text(text)
+    with pytest.raises(UserError, match=message):
+        replay_run(folder, path, 0, Said())
+    assert not (folder / "replay").exists()
+
+
+def test_a_file_that_is_no_text_is_refused(tmp_path):
+    (tmp_path / "lab.csv").write_bytes(b"\xff\xfe\x00\x01")
+    with pytest.raises(UserError, match="cannot read"):
+        read_measured(tmp_path / "lab.csv", 2)
+
+
+def test_a_run_that_cannot_be_replayed_is_refused(tmp_path, figures):
+    folder = loop_folder(tmp_path / "run", "pendulum")
+    path = measured_file(tmp_path / "lab.csv", "pendulum", *motion("pendulum", lambda t: 0 * t))
+    with pytest.raises(UserError, match=r"has no 003.npz with its 003.json; there is 000"):
+        replay_run(folder, path, 3, Said())
+    with pytest.raises(UserError, match="is no run folder"):
+        replay_run(tmp_path, path, 0, Said())
+    (folder / "replay").write_text("in the way")
+    with pytest.raises(UserError, match=r"cannot write .*replay"):
+        replay_run(folder, path, 0, Said())
+
+
+@pytest.mark.parametrize(("step", "told"), [(3.0, 0), (3.2, 1)])
+def test_half_a_turn_between_two_samples_looks_wrapped(tmp_path, step, told):
+    path = tmp_path / "lab.csv"
+    path.write_text(f"time,pos1,pos2,vel1,vel2\n0,0,0,0,0\n0.1,9,{step},0,0\n")
+    found = jumps(read_measured(path, 4), ["m", "rad", "m/s", "rad/s"])
+    assert len(found) == told
+    assert all("pos2 jumps by 3.2 rad at t = 0.1 s" in line for line in found)
+
+
+def test_the_columns_are_those_of_the_toolkits():
+    for plant, n in (("pendulum", 2), ("cartpole", 4)):
+        assert HEADS[plant].startswith(",".join(columns_of(n)))

@@ -1,0 +1,192 @@
+"""The page in a real browser: no error, no request, all figures, sorting, no sideways scroll on a phone."""
+
+import json
+import re
+
+import pytest
+
+from rtcd_jax.analysis.report import refresh, report
+from rtcd_jax.analysis.report.page import render
+from rtcd_jax.analysis.report.plots import plots
+from rtcd_jax.analysis.report.reading import compared, read_run
+from rtcd_jax.system.errors import UserError
+from tests.analysis.report import browser
+from tests.analysis.report.runs import candidate, experiment, finished, prove_and_verify, run_folder
+
+
+def written(tmp_path_factory, plants):
+    """Pages by robot, and one that compares two runs."""
+    folder = tmp_path_factory.mktemp("pages")
+    pages = {}
+    for plant in plants:
+        config = experiment(plant)
+        elites = [candidate(config, seed, scale) for seed, scale in ((1, 3.0), (2, 2.0), (3, 10.0))]
+        run = prove_and_verify(run_folder(folder / plant, config, candidate(config), elites))
+        pages[plant] = folder / f"{plant}.html"
+        pages[plant].write_text(render([read_run(run)]))
+    runs = compared([read_run(finished(folder / name, scale=scale)) for name, scale in (("rtc", 2.0), ("rtcd", 5.0))])
+    pages["both"] = folder / "both.html"
+    pages["both"].write_text(render(runs))
+    return pages
+
+
+@pytest.fixture(scope="module")
+def pages(tmp_path_factory):
+    return written(tmp_path_factory, ("pendulum", "cartpole"))
+
+
+@pytest.fixture(scope="module")
+def chromium(tmp_path_factory):
+    if browser.program() is None:
+        pytest.skip(f"no browser here: none of {', '.join(browser.NAMES)} is on the PATH (apt-get install chromium)")
+    with browser.Browser(tmp_path_factory.mktemp("profile")) as found:
+        yield found
+
+
+FIGURES = {"pendulum": 3 + 5, "cartpole": 4 + 5, "both": 3}
+"""A plane for each coordinate, levels and convergence; a course for each free variable where a run stands alone."""
+
+
+@pytest.mark.parametrize("name", FIGURES)
+@pytest.mark.parametrize("size", [browser.LAPTOP, browser.PHONE], ids=["laptop", "phone"])
+def test_a_browser_shows_every_figure_without_error_or_request_or_sideways_scroll(pages, chromium, name, size):
+    tab = chromium.open(pages[name], size, touch=size == browser.PHONE)
+    assert tab.complaints() == []
+    assert tab.requests() == []
+    drawn = tab.value("[...document.querySelectorAll('.plot')].map((box) => box.querySelectorAll('.main-svg').length)")
+    assert len(drawn) == FIGURES[name]
+    assert all(drawn)
+    assert tab.value("document.querySelectorAll('.scatterlayer .trace path').length") > 20
+    width = "[document.documentElement.scrollWidth, document.documentElement.clientWidth]"
+    assert len(set(tab.value(width))) == 1
+
+
+def test_a_page_that_asks_for_something_or_complains_would_be_seen(tmp_path, chromium):
+    path = tmp_path / "bad.html"
+    path.write_text(
+        "<!doctype html><img src='http://127.0.0.1:9/x.png'><script>console.error('no'); missing();</script>"
+    )
+    tab = chromium.open(path, browser.LAPTOP)
+    assert tab.requests() == ["http://127.0.0.1:9/x.png"]
+    assert len(tab.complaints()) >= 2
+
+
+SUMS = """(() => {
+  const table = [...document.querySelectorAll("section")].find((s) => s.querySelector("h2").textContent === "Elites");
+  const heads = [...table.querySelectorAll("th")];
+  const column = heads.findIndex((head) => head.textContent.startsWith("sum ["));
+  const read = () => [...table.querySelectorAll("tbody tr")].map((row) => row.cells[column].textContent);
+  const before = read();
+  const sorted = [1, 2].map(() => { heads[column].querySelector("button").click(); return read(); });
+  return [before, ...sorted, heads[column].getAttribute("aria-sort")];
+})()"""
+
+
+def test_a_click_on_a_heading_sorts_the_elites_by_number_and_a_second_one_turns_them_round(pages, chromium):
+    tab = chromium.open(pages["pendulum"], browser.LAPTOP)
+    stored, rising, falling, told = tab.value(SUMS)
+    assert stored == ["333", "222", "1110"]
+    assert rising == ["222", "333", "1110"]
+    assert falling == ["1110", "333", "222"]
+    assert told == "descending"
+    assert tab.complaints() == []
+
+
+def test_the_slider_draws_each_funnel_s_ellipse_of_its_time(pages, chromium):
+    tab = chromium.open(pages["pendulum"], browser.LAPTOP)
+    moved = """(() => {
+      const slider = document.querySelector(".moment input");
+      slider.value = 1;
+      slider.dispatchEvent(new Event("input"));
+      const box = document.querySelector(".plot");
+      const moments = figures[box.dataset.figure].moments;
+      return moments.map(({ source, trace, points, times }) =>
+        [box.data[trace].x, box.data[source].x.slice((times.length - 1) * points, times.length * points)]);
+    })()"""
+    for shown, last in tab.value(moved):
+        assert shown == last
+    assert tab.value("document.querySelector('.moment output').textContent") == "1.80 s"
+
+
+def test_the_page_names_nothing_outside_itself_and_forbids_every_request(pages):
+    for path in pages.values():
+        text = re.sub(r"<script>.*?</script>", "", path.read_text(), flags=re.DOTALL)
+        assert "default-src 'none'" in text
+        assert "http://" not in text
+        assert "https://" not in text
+        assert re.findall(r'(?:src|href)="(?!data:)', text) == []
+
+
+def test_what_a_page_holds_is_strict_json_and_its_names_are_escaped(tmp_path):
+    run = finished(tmp_path / "<b>&")
+    text = render([read_run(run)])
+    assert "<b>&" not in text
+    assert "&lt;b&gt;&amp;" in text
+    (data,) = re.findall(r'<script type="application/json" id="figures">(.*?)</script>', text, flags=re.DOTALL)
+    assert set(json.loads(data)) >= {"plane0", "levels", "convergence"}
+    assert "NaN" not in data
+
+
+def test_the_absence_of_an_initial_funnel_is_told(tmp_path):
+    config = experiment()
+    initial = candidate(config, status="RICCATI_INDEFINITE")
+    text = render([read_run(run_folder(tmp_path / "run", config, initial, candidate(config, 1)))])
+    assert "the initial candidate has no funnel (RICCATI_INDEFINITE)." in text
+
+
+def test_pictures_of_an_experiment_are_in_the_page(tmp_path, pages):
+    run = prove_and_verify(finished(tmp_path / "run"))
+    (run / "disturbance" / "off_nominal_map.png").write_bytes(b"picture")
+    assert '<img src="data:image/png;base64,cGljdHVyZQ=="' in render([read_run(run)])
+    assert "<img" not in pages["pendulum"].read_text()
+
+
+def test_a_page_that_is_there_is_brought_up_to_date_and_none_is_made(tmp_path):
+    run = finished(tmp_path / "run")
+    assert refresh(run) is None
+    assert not (run / "report.html").exists()
+    (run / "report.html").write_text(render([read_run(run)]))
+    prove_and_verify(run)
+    assert refresh(run) == run / "report.html"
+    assert (run / "report.html").read_text() == render([read_run(run)])
+    assert "promises kept" in (run / "report.html").read_text()
+    assert not (run / "figures").exists()
+
+
+def test_compared_searches_show_best_median_and_feasible_share_over_their_candidates(tmp_path):
+    runs = compared([read_run(finished(tmp_path / name, scale=scale)) for name, scale in (("rtc", 2.0), ("rtcd", 5.0))])
+    data = plots(runs)["convergence"]["data"]
+    assert [(line["name"], line["yaxis"]) for line in data[:3]] == [
+        ("rtc (sum)", "y"), ("rtc, median", "y"), ("rtc, feasible", "y2"),
+    ]  # fmt: skip
+    assert [line["y"] for line in data[3:]] == [[100.0, 101.0, 102.0], [60.0] * 3, [0.75] * 3]
+    assert all(line["x"] == [4, 8, 12] for line in data)
+    assert {line["line"]["color"] for line in data[3:]} == {runs[1].best.color}
+
+
+def test_one_run_gets_its_page_and_figures_several_get_one_beside_them(tmp_path, figures):
+    first, second = (finished(tmp_path / name, scale=scale) for name, scale in (("rtc", 2.0), ("rtcd", 5.0)))
+    page, *drawn = report([first])
+    assert page == first / "report.html"
+    assert {path.relative_to(first) for path in drawn} == {
+        first.relative_to(first) / "figures" / f"{name}.{kind}"
+        for name in ("overlay", "funnel", "levels", "courses", "convergence")
+        for kind in ("png", "pdf")
+    }
+    before = sorted(first.rglob("*"))
+    page, *drawn = report([first], tmp_path / "shared.html")
+    assert {path.parent for path in drawn} == {tmp_path / "shared_figures"}
+    assert sorted(first.rglob("*")) == before
+    assert report([first, second])[0] == tmp_path / "comparison.html"
+    assert report([first, second], tmp_path / "mine.html") == [
+        tmp_path / f"mine.{kind}" for kind in ("html", "png", "pdf")
+    ]
+
+
+def test_a_page_that_cannot_be_written_is_refused(tmp_path, figures):
+    run = finished(tmp_path / "run")
+    with pytest.raises(UserError, match=r"--to = .*: must be a file, and this is a folder"):
+        report([run], tmp_path)
+    (run / "figures").write_text("in the way")
+    with pytest.raises(UserError, match=r"cannot write .*figures"):
+        report([run])

@@ -1,0 +1,59 @@
+"""The reference of the configuration is up to date and lacks no key that a configuration can have."""
+
+import re
+
+import pytest
+
+from rtcd_jax.cli.config_page import reference
+from rtcd_jax.config.load import load, resolved
+from rtcd_jax.config.schema import PLANTS
+from tests.paths import ROOT
+
+ROW = re.compile(r"\| `(\S+)` \| (.*?) \| (.*?) \| (.*?) \| (.+) \|$", re.MULTILINE)
+
+
+def rows():
+    """Unit, default, range and meaning by key; those of all robots together."""
+    return {key: cells for key, *cells in ROW.findall(reference())}
+
+
+def test_the_page_is_up_to_date():
+    page = ROOT / "docs" / "config.md"
+    assert page.read_text() == reference(), "write it again: python -m rtcd_jax.cli.config_page docs/config.md"
+
+
+# One with a sweep is several configurations.
+CONFIGS = [path for path in sorted((ROOT / "configs").glob("*.yaml")) if "\nsweep:" not in path.read_text()]
+
+
+@pytest.mark.parametrize("path", CONFIGS, ids=lambda path: path.stem)
+def test_every_key_of_every_configuration_is_there(path):
+    def leaves(tree, prefix=""):
+        for name, branch in tree.items():
+            variable = isinstance(branch, dict) and "initial" in branch
+            if isinstance(branch, dict) and not variable:
+                yield from leaves(branch, f"{prefix}{name}.")
+            else:
+                yield f"{prefix}{name}"
+
+    assert set(leaves(resolved(load(path)))) <= rows().keys()
+
+
+def test_numbers_have_units_and_names_have_their_choices():
+    for key, (unit, default, limits, meaning) in rows().items():
+        named = default in ("true", "false") or "," in limits or key == "plant.name"
+        assert named or unit, key
+        assert meaning
+    told = rows()
+    assert told["search.objective"][2] == r"sum, integral, inlet, geometric\_mean"
+    assert told["search.population"][:3] == ["-", "128", ">= 4"]
+    assert told["policy.authority"][:3] == ["-", "1.0", "> 0 and <= 1"]
+    assert "or a variable" in told["policy.authority"][3]
+    assert told["plant.torque_limit"] == ["N m", "2.5", "> 0", r"largest \|torque\| of the motor"]
+
+
+def test_every_robot_has_its_tables():
+    page = reference()
+    for name, model in PLANTS.items():
+        assert page.count(f"### {name}\n") == 2
+        assert all(f"`design.{key}` | {unit} |" in page for key, unit in model.design.items())

@@ -1,0 +1,129 @@
+"""The stable result format says what an evaluation holds, in the names and shapes that others read."""
+
+import dataclasses
+import json
+
+import jax
+import numpy as np
+import pytest
+import scipy.stats
+
+from rtcd_jax.config.load import config_hash
+from rtcd_jax.elite.elite import Elite
+from rtcd_jax.elite.records import write_elite
+from rtcd_jax.evaluation import elite_effort
+from rtcd_jax.run.format import arrays_of, epsilon, record_of
+from rtcd_jax.system.files import plain
+from tests import pipeline
+
+KNOTS = 51
+
+
+def _row(index: int):
+    return jax.tree.map(lambda leaf: leaf[index], pipeline.evaluated())
+
+
+@pytest.fixture(scope="module")
+def arrays():
+    return arrays_of(pipeline.problem(), _row(pipeline.RTCD))
+
+
+@pytest.fixture(scope="module")
+def record():
+    return record_of(pipeline.problem(), elite_effort(pipeline.problem()), _row(pipeline.RTCD))
+
+
+def test_the_policy_of_the_record_is_the_candidate_s():
+    """Where the search chose it; else the configuration's, as everywhere in this box."""
+    evaluation, fixed = _row(pipeline.RTCD), {"input_weight": 1.0, "authority": 1.0, "discount": 0.0}
+    chosen = dataclasses.replace(evaluation.candidate, authority=np.float64(0.25))
+    effort = elite_effort(pipeline.problem())
+    assert record_of(pipeline.problem(), effort, evaluation)["policy"] == fixed
+    searched = dataclasses.replace(evaluation, candidate=chosen)
+    assert plain(record_of(pipeline.problem(), effort, searched)["policy"]) == {**fixed, "authority": 0.25}
+
+
+@pytest.mark.parametrize(
+    ("trials", "knots", "confidence"), [(64, 51, 0.99), (2000, 51, 0.99), (1, 1, 0.5), (300, 201, 0.9)]
+)
+def test_epsilon_is_clopper_and_pearsons_bound_for_every_knot(trials, knots, confidence):
+    """scipy's exact one-sided bound for no failure in `trials`, each knot with its share of the doubt."""
+    doubt = (1 - confidence) / knots
+    exact = scipy.stats.beta.ppf(1 - doubt, 1, trials)
+    bound = epsilon(np.full(knots, trials), confidence)
+    assert bound == pytest.approx(exact, rel=1e-10)
+    assert scipy.stats.binom.cdf(0, trials, bound) == pytest.approx(doubt, rel=1e-9)
+    two_sided = scipy.stats.binomtest(0, trials).proportion_ci(1 - 2 * doubt, "exact")
+    assert bound == pytest.approx(two_sided.high, rel=1e-9)
+
+
+def test_epsilon_is_that_of_the_knot_with_the_fewest_trials():
+    assert epsilon(np.array([2000, 50, 2000]), 0.99) == epsilon(np.array([50, 50, 50]), 0.99)
+    assert epsilon(np.array([2000, 0, 2000]), 0.99) == 1
+
+
+def test_the_arrays_have_the_documented_names_and_shapes(arrays):
+    n, m = 2, 1
+    shapes = {
+        "time": (KNOTS,), "x": (KNOTS, n), "u": (KNOTS - 1, m), "K": (KNOTS, m, n), "S": (KNOTS, n, n),
+        "rho": (KNOTS,), "trials": (KNOTS,), "Q": (n, n), "R": (m, m), "K_goal": (m, n), "x_goal": (n,), "u_max": (m,),
+        "volumes_sum": (), "volumes_integral": (), "volumes_inlet": (), "volumes_geometric_mean": (),
+        "volumes_per_knot": (KNOTS,), "genome": (5,),
+    }  # fmt: skip
+    assert {name: array.shape for name, array in arrays.items()} == shapes
+
+
+def test_the_arrays_fit_together(arrays):
+    """Gains are R^-1 B' S, volumes those of (S, rho), the goal's LQR is the last one, the clock has equal steps."""
+    mass, length, *_ = pipeline.CANDIDATES[pipeline.RTCD]
+    b = np.array([[0.0], [1 / (mass * length**2)]])
+    gains = np.linalg.solve(arrays["R"], b.T @ arrays["S"])
+    np.testing.assert_allclose(arrays["K"], gains, rtol=1e-10)
+    np.testing.assert_array_equal(arrays["K_goal"], arrays["K"][-1])
+    np.testing.assert_allclose(arrays["volumes_per_knot"], np.pi * arrays["rho"] / np.sqrt(np.linalg.det(arrays["S"])))
+    np.testing.assert_allclose(arrays["volumes_sum"], arrays["volumes_per_knot"].sum())
+    np.testing.assert_allclose(np.diff(arrays["time"]), arrays["time"][1], rtol=1e-9)
+    assert arrays["time"][0] == 0
+    np.testing.assert_allclose(arrays["x"][[0, -1]], [[0, 0], arrays["x_goal"]], atol=1e-9)
+    np.testing.assert_allclose(np.diag(arrays["Q"]), pipeline.CANDIDATES[pipeline.RTCD][2:4], rtol=1e-12)
+    assert np.all(np.abs(arrays["u"]) <= arrays["u_max"])
+
+
+def test_the_record_says_what_the_numbers_mean(arrays, record):
+    """Read back from JSON: the physics in full, the weights, the rung with its promise, the configuration."""
+    found = json.loads(json.dumps(plain(record)))
+    mass, length, q1, q2, r = pipeline.CANDIDATES[pipeline.RTCD]
+    config = pipeline.problem().config
+    physics = {"m": mass, "l": length, "b": 0.1, "g": 9.81, "torque_limit": 2.5}
+    assert found["plant"] == "pendulum"
+    assert found["parameters"] == pytest.approx(physics, rel=1e-12)
+    assert found["design"] == pytest.approx({"mass": mass, "length": length}, rel=1e-12)
+    assert found["weights"]["q"] == pytest.approx([q1, q2], rel=1e-12)
+    assert found["weights"]["r"] == pytest.approx([r], rel=1e-12)
+    assert found["units"]["states"] == {"theta": "rad", "theta_dot": "rad/s"}
+    assert found["units"]["design"] == {"mass": "kg", "length": "m"}
+    assert (found["status"], found["rung"]) == ("OK", "sampled")
+    assert found["samples"] == arrays["trials"].min()
+    assert found["epsilon"] == epsilon(arrays["trials"], config.funnel.confidence)
+    assert found["config_hash"] == config_hash(config)
+    assert found["duration"] == pytest.approx(arrays["time"][-1], rel=1e-12)
+    for name in ("sum", "integral", "inlet", "geometric_mean"):
+        assert found["volumes"][name] == arrays[f"volumes_{name}"]
+    share = arrays["volumes_per_knot"].max() / arrays["volumes_sum"]
+    assert found["volumes"]["share_of_largest_knot"] == pytest.approx(share)
+
+
+def test_a_result_can_be_verified(arrays, record):
+    """What is stored is all that an independent simulation of the funnel needs."""
+    elite = Elite.of(arrays, plain(record))
+    np.testing.assert_array_equal(elite.rho, arrays["rho"])
+    np.testing.assert_array_equal(elite.state_limits, pipeline.problem().state_limits)
+
+
+def test_a_failed_candidate_is_stored_with_its_status(tmp_path):
+    hard = _row(pipeline.HARD)
+    record = record_of(pipeline.problem(), elite_effort(pipeline.problem()), hard)
+    assert record["status"] == "FUNNEL_EMPTY"
+    assert record["volumes"]["sum"] == record["volumes"]["share_of_largest_knot"] == 0
+    write_elite(tmp_path, "initial", arrays_of(pipeline.problem(), hard), record)
+    assert json.loads((tmp_path / "initial.json").read_text())["status"] == "FUNNEL_EMPTY"
