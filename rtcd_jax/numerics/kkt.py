@@ -21,6 +21,10 @@ from jaxtyping import Array, Bool, Float
 
 from rtcd_jax.numerics.batched import spd_solve
 from rtcd_jax.numerics.entries import Matrix, Row, dot, plus, times
+from rtcd_jax.numerics.loops import packed_scan
+
+UNROLLED_STATES = 20
+"""States times knots in the body of a GPU's loop: fewer launches against a longer compilation."""
 
 
 class Subproblem(NamedTuple):
@@ -77,19 +81,21 @@ def solve(problem: Subproblem, floor: float = 1e-12) -> Step:
         before, policy = _eliminate_input(value, hessian, gradient, jacobian, defect, floor)
         return before, (policy, [*value.linear[:n]], _square(value.quadratic)[:n], [row[:n] for row in value.end])
 
-    first, (policy, slopes, rows, ends) = jax.lax.scan(eliminate_input, last, arrays, reverse=True)
+    unroll = max(1, UNROLLED_STATES // n)
+    first, (policy, slopes, rows, ends) = packed_scan(eliminate_input, last, arrays, reverse=True, unroll=unroll)
     dh, nu, convex = _solve_first_knot(first, problem, floor)
 
-    def roll(dx, stage):
+    def roll(carry, stage):
+        *dx, dh = carry
         (gain, offset, gain_end), slopes, defect = stage
         jacobian = eqx.combine(slopes, numbers[2])
         y = [*dx, dh]
         du = [-plus(dot(row, y), o, dot(end, nu)) for row, o, end in zip(gain, offset, gain_end, strict=True)]
         after = [plus(dot(row, [*y, *du]), c) for row, c in zip(jacobian, defect, strict=True)]
-        return after, (after, du)
+        return [*after, dh], (after, du)
 
-    start = [zero] * n
-    _, (dxs, dus) = jax.lax.scan(roll, start, (policy, arrays[2], defects))
+    stages = policy, arrays[2], defects
+    _, (dxs, dus) = packed_scan(roll, [zero] * n + [dh], stages, unroll=unroll)
     # The sweep meets the pinned end up to rounding, which would add up over the iterations.
     multipliers = [
         plus(dot(row, [*dxs, dh]), p, dot(column, nu))

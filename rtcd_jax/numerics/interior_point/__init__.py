@@ -17,18 +17,23 @@ from rtcd_jax.numerics.interior_point.iteration import Iteration
 from rtcd_jax.numerics.interior_point.model import Model
 from rtcd_jax.numerics.interior_point.problem import DEFAULTS, ControlProblem, Guess, Settings, Solution
 from rtcd_jax.numerics.lanes import solve_in_lanes
+from rtcd_jax.numerics.loops import on_gpu
 
 __all__ = ["ControlProblem", "Guess", "Settings", "Solution", "solve"]
 
 CACHE = 2**20
-"""Second-level cache of a core [bytes]."""
+"""Second-level cache of a CPU's core [bytes]."""
+MOST = 32
+"""Lanes of a CPU at most: beyond, stragglers cost more than calls."""
 VECTOR = 8
 """Lanes come in whole vectors: of the rest of a vector, a compiler may round sines and logarithms differently."""
 
 
-def _lanes_in_cache(intervals: int, w: int) -> int:
-    """Lanes whose Hessians fill a core's cache; more wait for memory, fewer for calls."""
-    return max(1, CACHE // (8 * intervals * w * w) // VECTOR) * VECTOR
+def _lanes(count: int, intervals: int, w: int) -> int:
+    """All problems at once on a GPU; on a CPU as many as have their Hessians in a core's cache."""
+    in_cache = max(1, CACHE // (8 * intervals * w * w) // VECTOR) * VECTOR
+    whole = -(-count // VECTOR) * VECTOR
+    return whole if on_gpu() else min(MOST, in_cache, whole)
 
 
 def solve(
@@ -63,6 +68,6 @@ def solve(
         return method.finished(state[0], state[2])
 
     wanted = jnp.sum(allowance > 0)
-    width = min(settings.lanes, _lanes_in_cache(guess.us.shape[0], model.n + 1 + model.m), -(-count // VECTOR) * VECTOR)
+    width = settings.lanes or _lanes(count, guess.us.shape[0], model.n + 1 + model.m)
     solution = solve_in_lanes(load, advance, finished, extract, count, width, wanted)
     return jax.tree.map(lambda leaf: leaf[..., place], solution)

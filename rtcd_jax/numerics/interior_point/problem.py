@@ -10,7 +10,7 @@ from jaxtyping import Array, Bool, Float, Int
 class Settings(NamedTuple):
     """Tolerances and the constants of the method."""
 
-    lanes: int = 32  # at most; whole vectors
+    lanes: int | None = None  # whole vectors; None: as many as the device wants
     defect_tolerance: float = 1e-9
     dual_tolerance: float = 1e-4  # relative to 1 + max |multiplier|
     complementarity_tolerance: float = 1e-5  # likewise
