@@ -19,6 +19,7 @@ from rtcd_jax import rollout
 from rtcd_jax.numerics import sampling
 from rtcd_jax.numerics.batched import solve_lower
 from rtcd_jax.numerics.ellipsoid import Ellipsoids
+from rtcd_jax.numerics.loops import packed_scan, short_scan
 from rtcd_jax.numerics.sphere import climb
 from rtcd_jax.problem import Problem
 from rtcd_jax.types import Candidate, Funnel, Policy, Status, first_failure
@@ -76,12 +77,11 @@ def _scan_knots(problem, candidate, sets: Ellipsoids, tracked, boxes, last, key,
 
     def backward(carry, knot):
         target, shrinkage, climbers = carry
-        index, box, key = knot
+        index, box, fresh = knot
         step = _Step.at(problem, candidate, sets, tracked, index)
 
         expected = jnp.minimum(jnp.sqrt(target) * shrinkage, box)
         climbers = climb(partial(step.ends_alone, expected), climbers, funnel.climbs)
-        fresh = sampling.directions(key, funnel.directions, n, dtype)
         directions = jnp.concatenate([fresh, climbers], 1)
 
         def look(radius, window):
@@ -95,7 +95,7 @@ def _scan_knots(problem, candidate, sets: Ellipsoids, tracked, boxes, last, key,
             crossings = jnp.minimum(_crossings(radii, value), _crossings(radii, peak))
             return jnp.min(crossings), jnp.maximum(value, peak)[:, -1]
 
-        radius, bad = jax.lax.scan(look, jnp.sqrt(target), jnp.asarray(WINDOWS, dtype))
+        radius, bad = short_scan(look, jnp.sqrt(target), jnp.asarray(WINDOWS, dtype))
         level = (1 - MARGIN) * radius**2
         # The worst of the random ones takes the place of the tamest climber: there may be several maxima.
         newcomer = _worst(fresh, bad[-1, : funnel.directions], 1)
@@ -104,8 +104,9 @@ def _scan_knots(problem, candidate, sets: Ellipsoids, tracked, boxes, last, key,
 
     keys = jax.random.split(key, boxes.shape[0])
     start = last, jnp.ones((), dtype), sampling.directions(keys[-1], funnel.climbers, n, dtype)
-    knots = jnp.arange(boxes.shape[0] - 1), boxes[:-1], keys[:-1]
-    _, levels = jax.lax.scan(backward, start, knots, reverse=True)
+    fresh = jax.vmap(lambda key: sampling.directions(key, funnel.directions, n, dtype))(keys[:-1])
+    knots = jnp.arange(boxes.shape[0] - 1), boxes[:-1], fresh
+    _, levels = packed_scan(backward, start, knots, reverse=True)
     return jnp.append(levels, last)
 
 

@@ -21,6 +21,7 @@ from rtcd_jax.numerics import riccati
 from rtcd_jax.numerics.batched import mm, transpose
 from rtcd_jax.numerics.derivatives import jacobian
 from rtcd_jax.numerics.hermite import cubic_hermite
+from rtcd_jax.numerics.loops import packed_scan
 from rtcd_jax.problem import Problem
 from rtcd_jax.types import Candidate, Policy, Status, Trajectory, first_failure
 
@@ -85,7 +86,7 @@ def stabilize(problem: Problem, candidate: Candidate, trajectory: Trajectory) ->
         return carry, value
 
     stages = jax.tree.map(lambda leaf: jnp.moveaxis(leaf, -1, 0), whole)
-    (_, definite), values = jax.lax.scan(backward, (last, reached), stages, reverse=True)
+    (_, definite), values = packed_scan(backward, (last, reached), stages, reverse=True)
     values = jnp.concatenate([values, last[None]])
     _, b = linearize(problem, candidate, trajectory.xs.T, inputs)
     gains = mm(transpose(b) / weights[:, None], jnp.moveaxis(values, 0, -1))

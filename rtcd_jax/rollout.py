@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from rtcd_jax.numerics.integrate import END, MIDDLE, START, rk4_varying_step, split
+from rtcd_jax.numerics.loops import short_scan
 from rtcd_jax.plants.base import Plant
 from rtcd_jax.policy import nominal
 from rtcd_jax.problem import Problem
@@ -98,7 +99,7 @@ def roll_intervals(problem: Problem, candidate: Candidate, tracked: Reference, x
         return (x, jnp.maximum(peak, _fill(x, limits))), None
 
     x = split(x)
-    (x, peak), _ = jax.lax.scan(step, (x, _fill(x, limits)), (tracked.states, tracked.gains))
+    (x, peak), _ = short_scan(step, (x, _fill(x, limits)), (tracked.states, tracked.gains))
     return jnp.stack(x), peak
 
 

@@ -18,6 +18,7 @@ from rtcd_jax.genome import decode, initial_genome
 from rtcd_jax.numerics import interior_point
 from rtcd_jax.numerics.derivatives import jacobian
 from rtcd_jax.numerics.integrate import componentwise, rk4, split
+from rtcd_jax.numerics.loops import packed_scan
 from rtcd_jax.problem import Problem
 from rtcd_jax.types import Candidate, Status, Trajectory
 
@@ -64,7 +65,7 @@ def plan(problem: Problem, candidates: Candidate) -> Trajectory:
 
     family = starts(problem, parameters.q.dtype)
     none = _nothing(family, candidates.q.shape[0])
-    (best, _), _ = jax.lax.scan(attempt, (none, none.iterations), family)
+    (best, _), _ = packed_scan(attempt, (none, none.iterations), family, carry=False)
     us, xs, h = (jnp.moveaxis(leaf, -1, 0) for leaf in (best.us, best.xs, best.h))
     status = jnp.where(best.solved, Status.OK, Status.TRAJECTORY_NOT_SOLVED).astype(jnp.int32)
     return Trajectory(us, xs, h, best.cost, best.defect, best.iterations, status)

@@ -18,6 +18,7 @@ from rtcd_jax import rollout
 from rtcd_jax.config.schema import FunnelConfig
 from rtcd_jax.numerics import sampling
 from rtcd_jax.numerics.ellipsoid import Ellipsoids
+from rtcd_jax.numerics.loops import packed_scan
 
 SAFETY = 0.98
 """Level over that of the lowest fresh state that failed."""
@@ -152,7 +153,8 @@ def _shrink(levels, starts, ends, inside):
         shrunk = _below(level, starts, failed)
         return shrunk, (shrunk, jnp.sum(failed))
 
-    _, (shrunk, failures) = jax.lax.scan(backward, levels[-1], (levels[:-1], starts, ends, inside), reverse=True)
+    knots = levels[:-1], starts, ends, inside
+    _, (shrunk, failures) = packed_scan(backward, levels[-1], knots, reverse=True)
     return jnp.append(shrunk, levels[-1]), failures
 
 

@@ -15,7 +15,6 @@ so that hard end states need no penalty: two small solves at knot 0 give dh and 
 from typing import NamedTuple
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
@@ -82,7 +81,9 @@ def solve(problem: Subproblem, floor: float = 1e-12) -> Step:
         return before, (policy, [*value.linear[:n]], _square(value.quadratic)[:n], [row[:n] for row in value.end])
 
     unroll = max(1, UNROLLED_STATES // n)
-    first, (policy, slopes, rows, ends) = packed_scan(eliminate_input, last, arrays, reverse=True, unroll=unroll)
+    first, (policy, slopes, rows, ends) = packed_scan(
+        eliminate_input, last, arrays, shared=1, unroll=unroll, reverse=True
+    )
     dh, nu, convex = _solve_first_knot(first, problem, floor)
 
     def roll(carry, stage):
@@ -95,7 +96,7 @@ def solve(problem: Subproblem, floor: float = 1e-12) -> Step:
         return [*after, dh], (after, du)
 
     stages = policy, arrays[2], defects
-    _, (dxs, dus) = packed_scan(roll, [zero] * n + [dh], stages, unroll=unroll)
+    _, (dxs, dus) = packed_scan(roll, [zero] * n + [dh], stages, shared=1, unroll=unroll)
     # The sweep meets the pinned end up to rounding, which would add up over the iterations.
     multipliers = [
         plus(dot(row, [*dxs, dh]), p, dot(column, nu))

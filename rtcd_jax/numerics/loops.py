@@ -6,9 +6,12 @@ unrolled, and the loops over knots carry, read and write one array each. The mat
 bits.
 """
 
+import itertools
+import math
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -41,35 +44,66 @@ def repeat(times: int, f: Callable, init):
     return short_scan(lambda carry, _: (f(carry), None), init, length=times)[0]
 
 
-def packed_scan(f: Callable, init, xs, *, reverse: bool = False, unroll: int = 1):
-    """`jax.lax.scan` with one array each for the carry [C …], the inputs [N X …] and the outputs [N Y …].
+def packed_scan(f: Callable, init, xs, *, shared: int = 0, unroll: int = 1, reverse: bool = False, carry: bool = True):
+    """`jax.lax.scan`; on a GPU with one array each for a step's inputs, its outputs and, if wanted, the carry.
 
-    The leaves of the carry broadcast to one shape, so do those of a step's inputs and of its outputs; they are numbers
-    of one floating dtype, or booleans, which are packed as 0 and 1. On a GPU, `unroll` steps stand in the loop's body.
+    A scan reads and writes every leaf by an operation of its own, which no CUDA graph takes in. The last `shared` axes
+    of every leaf have one shape, and stay; smaller leaves are broadcast to them. Leaves are numbers of one floating
+    dtype, booleans and integers below 2^53. `unroll` steps stand in the body of a GPU's loop.
     """
-    start, carry_layout = _pack(init, 0)
-    inputs, input_layout = _pack(xs, 1)
-    output_layout = None
+    if not on_gpu():
+        return jax.lax.scan(f, init, xs, reverse=reverse)
+    inputs, start = _Layout.of(xs, shared, leading=1), _Layout.of(init, shared)
+    outputs: list[_Layout] = []
 
-    def step(carry, x):
-        nonlocal output_layout
-        carry, y = f(_unpack(carry, carry_layout, 0), _unpack(x, input_layout, 0))
-        y, output_layout = _pack(y, 0)
-        return _pack(carry, 0)[0], y
+    def step(packed, x):
+        state, y = f(start.unpack(packed) if carry else packed, inputs.unpack(x))
+        outputs.append(_Layout.of(y, shared))
+        return start.pack(state) if carry else state, outputs[-1].pack(y)
 
-    carry, ys = jax.lax.scan(step, start, inputs, reverse=reverse, unroll=unroll if on_gpu() else 1)
-    return _unpack(carry, carry_layout, 0), _unpack(ys, output_layout, 1)
-
-
-def _pack(tree, axis: int):
-    leaves, structure = jax.tree.flatten(tree)
-    leaves = jnp.broadcast_arrays(*leaves)
-    dtypes = [leaf.dtype for leaf in leaves]
-    number = jnp.result_type(*(dtype for dtype in dtypes if dtype != bool))
-    return jnp.stack([leaf.astype(number) for leaf in leaves], axis), (structure, dtypes)
+    begin = start.pack(init) if carry else init
+    end, ys = jax.lax.scan(step, begin, inputs.pack(xs, leading=1), reverse=reverse, unroll=unroll)
+    return start.unpack(end) if carry else end, outputs[-1].unpack(ys, leading=1)
 
 
-def _unpack(packed, layout, axis: int):
-    structure, dtypes = layout
-    leaves = (jax.lax.index_in_dim(packed, i, axis, keepdims=False) for i in range(len(dtypes)))
-    return structure.unflatten([leaf != 0 if dtype == bool else leaf for leaf, dtype in zip(leaves, dtypes, strict=True)])
+class _Layout(NamedTuple):
+    """How the leaves of a tree stand in one array [*leading, sum of sizes, *shared]."""
+
+    structure: jax.tree_util.PyTreeDef
+    shapes: tuple[tuple[int, ...], ...]  # without the leading and the shared axes
+    dtypes: tuple
+    shared: tuple[int, ...]
+    number: jnp.dtype
+
+    @classmethod
+    def of(cls, tree, shared: int, leading: int = 0) -> "_Layout":
+        leaves, structure = jax.tree.flatten(tree)
+        leaves = [jnp.asarray(leaf) for leaf in leaves]
+        own = tuple(leaf.shape[leading : max(leading, leaf.ndim - shared)] for leaf in leaves)
+        common = jnp.broadcast_shapes(*(leaf.shape[leading + len(o) :] for leaf, o in zip(leaves, own, strict=True)))
+        floating = [leaf.dtype for leaf in leaves if jnp.issubdtype(leaf.dtype, jnp.floating)]
+        number = jnp.result_type(*floating) if floating else jnp.dtype(float)
+        return cls(structure, own, tuple(leaf.dtype for leaf in leaves), common, number)
+
+    def pack(self, tree, leading: int = 0):
+        """One array of the tree's leaves."""
+        if not self.shapes:
+            return None
+        parts = []
+        for leaf, own in zip(self.structure.flatten_up_to(tree), self.shapes, strict=True):
+            leaf = jnp.asarray(leaf, self.number)
+            front = leaf.shape[:leading]
+            leaf = jnp.broadcast_to(leaf, (*front, *own, *self.shared))
+            parts.append(leaf.reshape(*front, math.prod(own), *self.shared))
+        return jnp.concatenate(parts, leading)
+
+    def unpack(self, packed, leading: int = 0):
+        """The tree."""
+        sizes = [math.prod(own) for own in self.shapes]
+        ends = list(itertools.accumulate(sizes))
+        leaves = []
+        for own, dtype, size, end in zip(self.shapes, self.dtypes, sizes, ends, strict=True):
+            leaf = jax.lax.slice_in_dim(packed, end - size, end, axis=leading)
+            leaf = leaf.reshape(*packed.shape[:leading], *own, *self.shared)
+            leaves.append(leaf.astype(dtype))
+        return self.structure.unflatten(leaves)

@@ -2,12 +2,12 @@
 
 from collections.abc import Callable
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 
 from rtcd_jax.numerics.batched import mtm, mtv, mv, spd_solve
 from rtcd_jax.numerics.derivatives import value_and_jacobian
+from rtcd_jax.numerics.loops import repeat, short_scan
 
 PULLS = np.array([0.01, 0.1, 1.0])
 """How strongly a step is drawn back to where it starts: the better the quadratic model, the weaker the best one."""
@@ -31,7 +31,7 @@ def climb(f: Callable, y, steps: int):
         better = jnp.max(found, -1) > jnp.sum(value**2, 0)
         return jnp.where(better, jnp.take_along_axis(tried, highest[None], -1)[..., 0], y), None
 
-    return jax.lax.scan(step, y, length=steps)[0]
+    return short_scan(step, y, length=steps)[0]
 
 
 def _largest_nearby(curvature, slope, y):
@@ -49,7 +49,7 @@ def _largest_nearby(curvature, slope, y):
         z, positive = spd_solve(s * eye - curvature[..., None], pulled[:, None])
         return z[:, 0], positive
 
-    def halve(_, bracket):
+    def halve(bracket):
         low, high = bracket
         middle = 0.5 * (low + high)
         z, positive = solve(middle)
@@ -57,6 +57,6 @@ def _largest_nearby(curvature, slope, y):
         return jnp.where(inside, low, middle), jnp.where(inside, middle, high)
 
     high = size[..., None] + jnp.linalg.norm(pulled, axis=0)
-    _, s = jax.lax.fori_loop(0, BISECTIONS, halve, (jnp.zeros_like(high), high))
+    _, s = repeat(BISECTIONS, halve, (jnp.zeros_like(high), high))
     z, _ = solve(s)
     return z / jnp.linalg.norm(z, axis=0)

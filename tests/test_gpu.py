@@ -1,0 +1,59 @@
+"""Every program that a run puts on its devices lowers for a GPU, and asks nothing of the host.
+
+Lowered without one. That they are fast there is counted by launch/bench/gpu_budget.py.
+"""
+
+import re
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import yaml
+
+from rtcd_jax.analysis.disturb import scenarios
+from rtcd_jax.config import load as configuration
+from rtcd_jax.evaluation import elite_effort, make_evaluate, resample
+from rtcd_jax.numerics.loops import compiled_for
+from rtcd_jax.problem import make_problem
+from rtcd_jax.search import cmaes
+from tests.paths import CONFIGS
+
+ON_DEVICE = {"cusolver_syevd_ffi", "Sharding", "SPMDFullToShardShape", "SPMDShardToFullShape"}
+"""Calls that are a GPU library's or the partitioner's own."""
+
+
+def lowered(function, *arguments):
+    """The program for CUDA as text."""
+    with compiled_for("cuda"):
+        return jax.jit(function).trace(*arguments).lower(lowering_platforms=("cuda",)).as_text()
+
+
+def calls(program):
+    """Everything that the program asks of somebody else."""
+    return set(re.findall(r"custom_call @([\w$.]+)", program)) - ON_DEVICE
+
+
+@pytest.fixture(scope="module", params=["pendulum", pytest.param("cartpole", marks=pytest.mark.slow)])
+def problem(request):
+    data = yaml.safe_load((CONFIGS / f"{request.param}_rtcd.yaml").read_text())
+    data["funnel"] = data.get("funnel", {}) | {"rollouts": "closed_form"}
+    return make_problem(configuration.parse(data))
+
+
+def test_a_generation_and_an_elite_ask_nothing_of_the_host(problem):
+    genomes, key = jnp.zeros((16, len(problem.free))), jax.random.key_data(jax.random.key(0))
+    wrapped = jax.random.wrap_key_data
+    evaluate = make_evaluate(problem)
+    program = lowered(lambda genomes, key: evaluate(genomes, wrapped(key)), genomes, key)
+    assert calls(program) == set()
+    assert "xla_python" not in program
+    shapes = jax.eval_shape(lambda genomes, key: evaluate(genomes, wrapped(key)), genomes, key)
+    one = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape[1:], leaf.dtype), shapes)
+    again = partial(resample, problem, elite_effort(problem))
+    assert calls(lowered(lambda evaluation, key: again(evaluation, wrapped(key)), one, key)) == set()
+
+
+def test_a_generation_asks_and_tells_on_the_device():
+    strategy = cmaes.Strategy(5, 128, 0.3)
