@@ -6,7 +6,6 @@
 import hashlib
 import inspect
 import json
-import re
 from collections.abc import Callable, Collection, Iterator, Mapping
 from pathlib import Path
 from typing import Annotated, Any
@@ -22,6 +21,7 @@ from pydantic import (
     field_validator,
 )
 
+from rtcd_jax.config import yaml12
 from rtcd_jax.config.schema import (
     CheckpointConfig,
     ElitesConfig,
@@ -36,7 +36,7 @@ from rtcd_jax.config.schema import (
     read_plant,
 )
 from rtcd_jax.config.settings import Settings, problems_of
-from rtcd_jax.system.errors import ConfigError, Problem, closest
+from rtcd_jax.system.errors import ConfigError, Problem, closest, printable
 
 EXAMPLE = """\
 plant: {name: pendulum}
@@ -183,22 +183,6 @@ def parse(data: Any, source: str = "configuration") -> Config:
     raise ConfigError(problems, source)
 
 
-class _Loader(yaml.SafeLoader):
-    """PyYAML's safe loader, but 1e-3 is a number, as in YAML 1.2, and a key given twice is an error."""
-
-    def construct_mapping(self, node, deep=False):
-        seen = set()
-        for key, _ in node.value:
-            if isinstance(key, yaml.ScalarNode) and key.value in seen:
-                raise yaml.MarkedYAMLError(problem=f"the key {key.value!r} is given twice", problem_mark=key.start_mark)
-            seen.add(str(key.value))
-        return super().construct_mapping(node, deep)
-
-
-_EXPONENT_WITHOUT_DOT = re.compile(r"[-+]?\d+[eE][-+]?\d+$")
-_Loader.add_implicit_resolver("tag:yaml.org,2002:float", _EXPONENT_WITHOUT_DOT, list("-+0123456789"))
-
-
 def parse_yaml(text: str | bytes, source: str = "configuration") -> Config:
     """The configuration that a YAML text describes; `ConfigError` if it is no YAML or no valid configuration."""
     return parse(_plain_yaml(text, source), source)
@@ -206,13 +190,9 @@ def parse_yaml(text: str | bytes, source: str = "configuration") -> Config:
 
 def _plain_yaml(text: str | bytes, source: str) -> Any:
     try:
-        return yaml.load(text, _Loader)
-    except yaml.MarkedYAMLError as error:
-        mark = error.problem_mark
-        place = f"line {mark.line + 1}, column {mark.column + 1}: " if mark else ""
-        raise ConfigError([Problem((), f"no valid YAML: {place}{error.problem}")], source) from None
-    except yaml.YAMLError as error:
-        raise ConfigError([Problem((), f"no valid YAML: {error}")], source) from None
+        return yaml12.read(text)
+    except yaml12.NotYaml as error:
+        raise ConfigError([Problem((), printable(error))], source) from None
 
 
 def load(path: Path) -> Config:
@@ -231,7 +211,8 @@ def read_yaml(path: Path) -> Any:
         there = sorted(str(other) for other in folder.glob("*.y*ml"))
         advice = closest(path, there) if there else f"{folder} has no YAML file"
         raise ConfigError([Problem((), f"{what}; {advice}")], str(path))
-    return _plain_yaml(path.read_bytes(), str(path))
+    with path.open("rb") as file:
+        return _plain_yaml(file.read(yaml12.LARGEST_FILE + 1), str(path))
 
 
 def resolved(config: Config) -> dict[str, Any]:

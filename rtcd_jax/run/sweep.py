@@ -15,6 +15,7 @@ import copy
 import csv
 import io
 import itertools
+import math
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -31,6 +32,7 @@ from rtcd_jax.system.files import make_folder, read_json, reading, replace
 
 TABLE = "table.csv"
 WAYS = ("product", "zip")
+MOST_CASES = 10_000
 VOLUMES = ("sum", "integral", "inlet", "geometric_mean")
 
 
@@ -82,6 +84,10 @@ def _problems(section: Any) -> Iterator[Problem]:
     lengths = {key: len(values) for key, values in _of(section, "zip").items() if isinstance(values, list)}
     if len(set(lengths.values())) > 1:
         yield Problem(("sweep", "zip"), "all lists must be of one length", lengths)
+    cases = math.prod(len(values) for values in _of(section, "product").values() if isinstance(values, list))
+    cases *= max(lengths.values(), default=1)
+    if cases > MOST_CASES:
+        yield Problem(("sweep",), f"makes {cases} runs, must make {MOST_CASES} at most")
     twice = _of(section, "product").keys() & _of(section, "zip").keys()
     if twice:
         yield Problem(("sweep",), "a key stands in product or in zip, not in both", sorted(twice))

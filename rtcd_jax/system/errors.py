@@ -8,6 +8,7 @@ NO_VALUE = object()
 """Stands for a value where there is none to show."""
 _LONGEST_VALUE = 60
 _LONGEST_KEY = 120
+_MOST_PROBLEMS = 20
 
 
 class Problem(NamedTuple):
@@ -29,13 +30,18 @@ class UserError(ValueError):
 
 
 class ConfigError(UserError):
-    """Everything that is wrong with a configuration, at once: a line, or one each under a heading."""
+    """Everything that is wrong with a configuration, at once: a line, or one each under a heading, twenty at most."""
 
     def __init__(self, problems: Iterable[Problem], source: str = "configuration"):
         self.problems = tuple(problems)
         self.source = source
         first, *others = self.problems
-        told = [f"{source}: {len(self.problems)} errors", *(f"  {problem}" for problem in self.problems)]
+        told = [
+            f"{source}: {len(self.problems)} errors",
+            *(f"  {problem}" for problem in self.problems[:_MOST_PROBLEMS]),
+        ]
+        if len(self.problems) > _MOST_PROBLEMS:
+            told.append(f"  and {len(self.problems) - _MOST_PROBLEMS} more")
         if not others:
             told = [f"{source}: {first if first.path or first.value is not NO_VALUE else first.text}"]
         super().__init__("\n".join(told))

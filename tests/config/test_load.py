@@ -273,7 +273,7 @@ def test_no_mapping_at_all():
         ("plant: {", "no valid YAML: line 1, column 9: expected the node content"),
         ("plant: 1\nplant: 2", "no valid YAML: line 2, column 1: the key 'plant' is given twice"),
         ("plant: \x00", "no valid YAML: unacceptable character"),
-        ("[1]: 2\n[1]: 2", "no valid YAML: line 1, column 1: found unhashable key"),
+        ("[1]: 2\n[1]: 2", "no valid YAML: line 1, column 1: a key must be a text"),
     ],
 )
 def test_no_yaml(text, words):
