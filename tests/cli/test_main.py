@@ -12,6 +12,7 @@ import pytest
 from rtcd_jax.cli import main as cli
 from rtcd_jax.config.load import Config, load, resolved
 from rtcd_jax.system.devices import cores
+from tests.paths import ROOT
 
 RTCD = str(ROOT / "configs" / "pendulum_rtcd.yaml")
 
@@ -164,9 +165,10 @@ def run_module(monkeypatch):
     """Stands in for the run: records what the command line hands over."""
     calls = []
     module = types.ModuleType("rtcd_jax.run.optimize")
-    module.optimize = lambda config, folder, console, cluster: calls.append((config, folder))
+    module.optimize = lambda config, folder, console, cluster: calls.append((config, folder)) or True
     monkeypatch.setitem(sys.modules, "rtcd_jax.run.optimize", module)
     monkeypatch.setattr(cli, "prepare_jax", lambda *_: None)
+    monkeypatch.setattr("rtcd_jax.analysis.report.report", lambda folders: (folders[0] / "report.html",) * 2)
     monkeypatch.setattr("rtcd_jax.system.cluster.Cluster.heed", lambda cluster: None)  # signals stay pytest's
     module.calls = calls
     return module
@@ -226,18 +228,18 @@ def test_a_bug_is_no_user_error(run_module):
 @pytest.mark.parametrize(("held", "code"), [(True, 0), (False, 1)])
 def test_verify_exits_by_the_promise(monkeypatch, tmp_path, held, code):
     calls = []
-    module = types.ModuleType("rtcd_jax.analysis.verify")
+    module = types.ModuleType("rtcd_jax.analysis.verify.run")
     module.verify_run = lambda folder, states, seed, workers, console: calls.append((folder, states, seed)) or held
-    monkeypatch.setitem(sys.modules, "rtcd_jax.analysis.verify", module)
+    monkeypatch.setitem(sys.modules, "rtcd_jax.analysis.verify.run", module)
     monkeypatch.setattr(cli, "prepare_jax", lambda *_: None)
     assert cli.main(["verify", str(tmp_path), "--states", "10", "--seed", "3"]) == code
     assert calls == [(tmp_path, 10, 3)]
 
 
 def test_a_page_that_cannot_be_brought_up_to_date_ends_nothing(monkeypatch, tmp_path, capsys):
-    module = types.ModuleType("rtcd_jax.analysis.verify")
+    module = types.ModuleType("rtcd_jax.analysis.verify.run")
     module.verify_run = lambda *_: True
-    monkeypatch.setitem(sys.modules, "rtcd_jax.analysis.verify", module)
+    monkeypatch.setitem(sys.modules, "rtcd_jax.analysis.verify.run", module)
     monkeypatch.setattr(cli, "prepare_jax", lambda *_: None)
     assert cli.main(["verify", str(tmp_path)]) == 0
     assert capsys.readouterr().out == ""
@@ -246,6 +248,19 @@ def test_a_page_that_cannot_be_brought_up_to_date_ends_nothing(monkeypatch, tmp_
     told = capsys.readouterr().out
     assert (
         told == f"{tmp_path}/report.html does not show this yet: {tmp_path} is no run folder: it has no format.json\n"
+    )
+
+
+def test_a_failing_report_ends_nothing(run_module, tmp_path, monkeypatch, capsys):
+    """The run is finished; what went wrong is told, with the command that tries again."""
+
+    def broken(_):
+        raise RuntimeError("no fonts")
+
+    monkeypatch.setattr("rtcd_jax.analysis.report.report", broken)
+    assert cli.main(["optimize", RTCD, "--run", str(tmp_path)]) == 0
+    assert capsys.readouterr().out == (
+        f"the run is finished, but its report failed: RuntimeError('no fonts'); `rtcd report {tmp_path}` makes it\n"
     )
 
 
@@ -296,7 +311,7 @@ def test_export_hands_on_the_elite_and_the_folder(monkeypatch, tmp_path):
 
 
 def test_disturb_hands_on_states_and_seed(monkeypatch, tmp_path):
-    calls = _standing_in(monkeypatch, "disturb", "disturb_run")
+    calls = _standing_in(monkeypatch, "analysis.disturb", "disturb_run")
     assert cli.main(["disturb", str(tmp_path)]) == 0
     assert cli.main(["disturb", str(tmp_path), "--states", "10", "--seed", "3"]) == 0
     assert calls == [(tmp_path, 1000, 0), (tmp_path, 10, 3)]
