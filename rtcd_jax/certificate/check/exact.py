@@ -25,6 +25,10 @@ class Refused(Exception):
         super().__init__(f"{place}: {reason}")
 
 
+class Damaged(Refused):
+    """The file is not what was written: it is no JSON, or a digest is another."""
+
+
 def insist(holds: bool, place: str, reason: str) -> None:
     if not holds:
         raise Refused(place, reason)

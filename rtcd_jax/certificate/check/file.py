@@ -6,7 +6,7 @@ import re
 from typing import Any, NamedTuple
 
 from rtcd_jax.certificate.check.claim import PLANTS, Claim
-from rtcd_jax.certificate.check.exact import MAX_ORDER, Q, Refused, insist
+from rtcd_jax.certificate.check.exact import MAX_ORDER, Damaged, Q, Refused, insist
 from rtcd_jax.certificate.check.funnel import Stretch
 from rtcd_jax.certificate.check.goal import Shell
 from rtcd_jax.certificate.check.squares import Witness, monomials
@@ -34,7 +34,8 @@ class Node(NamedTuple):
     def sealed(self) -> None:
         """Refuses values that are not those of the digests."""
         for name, digest in self.value["sha256"].items():
-            insist(digest == seal(self.value[name]), f"{self.place}.{name}", "was changed: its digest is another")
+            if digest != seal(self.value[name]):
+                raise Damaged(f"{self.place}.{name}", "was changed: its digest is another")
 
     def insist(self, holds: bool, reason: str) -> None:
         insist(holds, self.place, reason)
@@ -163,12 +164,13 @@ def read_goal(node: Node, claim: Claim) -> tuple[list, int, Any, list[Shell]]:
 
 def _unique(pairs: list[tuple[str, Any]]) -> dict:
     found = dict(pairs)
-    insist(len(found) == len(pairs), "certificate", "has the same key twice")
+    if len(found) != len(pairs):
+        raise Damaged("certificate", "has the same key twice")
     return found
 
 
 def _no_constant(name: str) -> Any:
-    raise Refused("certificate", f"holds {name}")
+    raise Damaged("certificate", f"holds {name}")
 
 
 def parse(text: str) -> Any:
@@ -178,6 +180,6 @@ def parse(text: str) -> Any:
     except Refused:
         raise
     except RecursionError:
-        raise Refused("certificate", "is nested too deeply") from None
+        raise Damaged("certificate", "is nested too deeply") from None
     except ValueError as error:
-        raise Refused("certificate", f"is no JSON: {error}") from None
+        raise Damaged("certificate", f"is no JSON: {error}") from None

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 from rtcd_jax.certificate.check.claim import Claim
 from rtcd_jax.certificate.check.exact import Q, Refused, insist, root_up
-from rtcd_jax.certificate.check.file import Node, parse, read_claim, read_goal, read_stretch
+from rtcd_jax.certificate.check.file import Node, parse, read_claim, read_goal, read_stretch, seal
 from rtcd_jax.certificate.check.funnel import Stretch, funnel_obligations, insist_bounds, motion
 from rtcd_jax.certificate.check.goal import goal_field, goal_obligations, insist_arrival
 from rtcd_jax.certificate.check.matrix import cofactors, dot
@@ -18,9 +18,13 @@ FORMAT, VERSION = "rtcd certificate", 1
 
 
 class Report(NamedTuple):
-    """What an accepted certificate proves, rounded: volumes in the product of the states' units, times in s."""
+    """What an accepted certificate proves, rounded: volumes in the product of the states' units, times in s.
+
+    `digest` is the SHA-256 of the claim's canonical JSON.
+    """
 
     claim: Claim
+    digest: str
     stretches: int
     shells: int
     start: float
@@ -100,7 +104,7 @@ def check(content: Any, progress: Callable[[int, int], None] = lambda done, of: 
     volumes, axes = volumes_of(claim, pieces, l_goal)
     begin = float((claim.start[0] + claim.start[1]) * claim.dt)
     return Report(
-        claim, len(pieces), shells, begin, float(len(claim.u) * claim.dt), volumes, axes,
+        claim, seal(about.value), len(pieces), shells, begin, float(len(claim.u) * claim.dt), volumes, axes,
         [float(r) for r in rest], float(least), {str(k): str(v) for k, v in notes.value.items()},
     )  # fmt: skip
 
@@ -152,7 +156,7 @@ def sentence(name: str, report: Report) -> str:
         f"{v['inlet']:.6g}, sum over the knots {v['sum']:.6g}, integral over time {v['integral']:.6g} s, goal region "
         f"{v['goal']:.6g}. {report.stretches} intervals of time and {report.shells} of level, smallest margin "
         f"{report.margin:.2g}. It is a statement about this model, its state known and its input continuous, not about "
-        "hardware."
+        f"hardware. Claim: sha256 {report.digest}."
     )
 
 

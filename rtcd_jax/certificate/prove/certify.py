@@ -1,5 +1,6 @@
 """One elite's certificate: goal region, then funnel, every step kept on disk, so that a killed search goes on."""
 
+import hashlib
 import json
 import time
 from collections.abc import Callable, Mapping
@@ -16,6 +17,7 @@ from rtcd_jax.certificate.prove.backward import SPARE, Descent, Front
 from rtcd_jax.certificate.prove.closed_loop import Loop, claim_of, double, doubles, sealed
 from rtcd_jax.certificate.prove.goal import GoalRegion, goal_region
 from rtcd_jax.certificate.prove.levels import directions, leveled
+from rtcd_jax.certificate.standing import accepted, remember
 from rtcd_jax.elite.records import read_elite
 from rtcd_jax.system.files import replace
 from rtcd_jax.system.journal import Journal
@@ -111,9 +113,11 @@ def _finish(
     path: Path, content: dict[str, Any], arrays: Mapping[str, np.ndarray], rung: str, seconds: float, journal: Journal
 ) -> Outcome:
     """The written certificate; on the rung *proved* it was accepted as a whole before."""
+    file = (json.dumps(content, separators=(",", ":")) + "\n").encode()
     if rung == "proved":
-        check.check(content)
-    replace(path, (json.dumps(content, separators=(",", ":")) + "\n").encode())
+        digest = hashlib.sha256(file).hexdigest()
+        remember(digest, accepted(check.check(check.parse(file.decode())), digest))
+    replace(path, file)
     journal.close()
     claim = check.read_claim(Node("claim", content["claim"]))
     pieces = [check.read_stretch(Node("funnel", each), claim) for each in content["funnel"]]
