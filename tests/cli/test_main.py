@@ -321,7 +321,6 @@ PREPARED = """
 from rtcd_jax.system.devices import prepare_jax
 prepare_jax()
 import jax
-from tests.paths import ROOT
 print(jax.device_count(), jax.numpy.zeros(1).dtype)
 """
 
