@@ -138,9 +138,11 @@ def report(arguments: Sequence[str]) -> int:
 
     options = read_report(arguments)
     from rtcd_jax.analysis.report import report as write_report
+    from rtcd_jax.system.console import Console
 
-    page, *figures = write_report(options.runs, options.to)
-    print(f"{page}, and {len(figures)} figures in {figures[0].parent}")
+    with Console() as console:
+        page, *figures = write_report(options.runs, options.to, console)
+        console.message(f"{page}, and {len(figures)} figures in {figures[0].parent}")
     return OK
 
 
@@ -149,7 +151,7 @@ def _refresh(run: Path, console: Any) -> None:
     from rtcd_jax.analysis.report import refresh
 
     try:
-        page = refresh(run)
+        page = refresh(run, console)
     except UserError as error:
         console.message(f"{run / 'report.html'} does not show this yet: {error}")
     else:

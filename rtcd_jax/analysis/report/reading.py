@@ -1,8 +1,9 @@
 """A finished run as reports show it: everything that its folder holds, checked once and given names."""
 
 import itertools
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, final
 
@@ -10,10 +11,12 @@ import numpy as np
 from jaxtyping import Float
 
 from rtcd_jax.analysis.report.words import VOLUMES
+from rtcd_jax.certificate.standing import certificate_path, standing
 from rtcd_jax.config.load import Config
 from rtcd_jax.elite.records import elite_names, read_config, read_elite, read_generations, require_elites
+from rtcd_jax.system.console import Console, silent
 from rtcd_jax.system.errors import UserError
-from rtcd_jax.system.files import read_json
+from rtcd_jax.system.files import read_json, reading
 
 # Okabe and Ito's colors: told apart by all kinds of color vision.
 BLUE, VERMILION = "#0072B2", "#D55E00"
@@ -22,7 +25,7 @@ COLORS = (VERMILION, "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
 INITIALS = (BLUE, "#5F6B7A", "#8C6D31", "#7A5195")
 """Of their initial candidates, where they differ."""
 
-
+_ADVICE = "remove it, or make it again"
 _OF_A_GENERATION = (
     "index", "evaluations", "objective", "best", "median", "best_so_far", "feasible", "counts", "sigma", "restarts",
     "genomes", "volumes",
@@ -72,6 +75,38 @@ class Experiment:
 
 @final
 @dataclass(frozen=True)
+class Certificate:
+    """What is shown of an elite's funnel, from `start` [s] on, by an effort of `seconds`, beside what was sampled.
+
+    `guarantee` is "proved" only where the checker accepts the stored file for the stored elite; it is None, and
+    `shown` empty, where the file shows nothing of this elite: `verdict` says so in a word, `reason` in a sentence.
+    """
+
+    guarantee: str | None
+    verdict: str
+    reason: str = ""
+    start: float = 0.0
+    intervals: int = 0
+    seconds: float = 0.0
+    sampled: Mapping[str, float] = field(default_factory=dict)
+    shown: Mapping[str, float] = field(default_factory=dict)
+
+
+@final
+@dataclass(frozen=True)
+class Checking:
+    """How far the checker is with a certificate, in intervals."""
+
+    file: Path
+    done: int
+    total: int
+
+    def __str__(self) -> str:
+        return f"checking {self.file}  interval {self.done}/{self.total}"
+
+
+@final
+@dataclass(frozen=True)
 class Run:
     """A run folder. `initial` is None where the initial candidate has no funnel, and `absence` says why.
 
@@ -87,7 +122,7 @@ class Run:
     absence: str
     generations: Sequence[Mapping[str, Any]]
     elites: Mapping[str, Mapping[str, Any]]
-    certificates: Mapping[str, Mapping[str, Any] | None]
+    certificates: Mapping[str, Certificate]
     verification: Mapping[str, Mapping[str, Any]]
     experiments: Sequence[Experiment]
     provenance: Mapping[str, Any]
@@ -104,8 +139,8 @@ class Run:
         return sum(spent) if spent and None not in spent else None
 
 
-def read_run(path: Path) -> Run:
-    """Everything that a finished run left in its folder.
+def read_run(path: Path, console: Console | None = None) -> Run:
+    """Everything that a finished run left in its folder; its certificates are checked, and `console` told so.
 
     Raises:
         UserError: no run folder, no elites yet, an elite without a funnel or with something missing, or a file that
@@ -124,7 +159,7 @@ def read_run(path: Path) -> Run:
         absence=absence,
         generations=read_search(path),
         elites={name: read_elite(folder, name)[1] for name in elite_names(path)},
-        certificates=_json(path / "certificates" / "summary.json"),
+        certificates=dict(_certificates(path, console or silent())),
         verification={file.stem: _json(file) for file in sorted((path / "verification").glob("*.json"))},
         experiments=tuple(_experiments(path / "disturbance")),
         provenance=_json(path / "provenance.json"),
@@ -198,6 +233,44 @@ def _same(first: Shown, second: Shown) -> bool:
     return first.x.shape == second.x.shape and np.allclose(first.x, second.x) and np.allclose(first.S, second.S)
 
 
+def _certificates(path: Path, console: Console) -> Iterator[tuple[str, Certificate]]:
+    """What `rtcd certify` left, by elite, as far as the files still bear it out."""
+    summary = path / "certificates" / "summary.json"
+    for name, written in _json(summary).items():
+        if written is None:
+            yield name, Certificate(None, "not found", "no goal region could be shown")
+            continue
+        found = standing(path, name, _telling(console, certificate_path(path, name)))
+        with reading(summary, _ADVICE):
+            told = {"seconds": float(written["seconds"]), "sampled": _numbers(written["sampled"])}
+            if found.proved:
+                shown = {"start": found.start, "intervals": found.intervals, "shown": found.volumes}
+                yield name, Certificate("proved", found.verdict, **told, **shown)
+            elif found.verdict == "refused" and written["rung"] == "certified":  # in floating-point numbers, no more
+                shown = {"start": float(written["start"]), "intervals": int(written["intervals"])}
+                shown |= {"shown": _numbers(written["found"])}
+                yield name, Certificate("certified", found.verdict, found.reason, **told, **shown)
+            else:
+                yield name, Certificate(None, found.verdict, found.reason, **told)
+
+
+def _numbers(written: Mapping[str, Any]) -> dict[str, float]:
+    return {str(key): float(value) for key, value in written.items()}
+
+
+def _telling(console: Console, file: Path) -> Callable[[int, int], None]:
+    """What says every second how far the checker is."""
+    told = time.monotonic()
+
+    def progress(done: int, of: int) -> None:
+        nonlocal told
+        if time.monotonic() - told >= 1:
+            told = time.monotonic()
+            console.progress(Checking(file, done, of))
+
+    return progress
+
+
 def _experiments(folder: Path) -> list[Experiment]:
     found = []
     for file in sorted(folder.glob("*.json")):
@@ -208,4 +281,4 @@ def _experiments(folder: Path) -> list[Experiment]:
 
 def _json(path: Path) -> dict[str, Any]:
     """The file's content, nothing where there is no file. Raises UserError if it is damaged."""
-    return read_json(path, "remove it, or make it again") if path.is_file() else {}
+    return read_json(path, _ADVICE) if path.is_file() else {}

@@ -1,10 +1,12 @@
 """Finished run folders without a search: funnels of random ellipsoids, generations of known numbers."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import yaml
 
+from rtcd_jax.analysis.report.reading import Certificate, read_run
 from rtcd_jax.config import load as configuration
 from rtcd_jax.elite.records import FORMAT, VERSION, write_elite
 from rtcd_jax.system.files import plain, replace_json
@@ -22,11 +24,12 @@ SEARCHED_POLICY = {
     "authority": {"initial": 0.05, "min": 0.01, "max": 1.0}, "discount": {"initial": 0.5, "min": 0.0, "max": 2.0}
 }  # fmt: skip
 YAMLS = {"pendulum": configuration.EXAMPLE, "cartpole": CARTPOLE}
-CERTIFICATE = {
-    "elite": "000", "rung": "proved", "start": 0.0, "intervals": 6, "seconds": 7.25,
-    "sampled": {"inlet": 0.9, "sum": 333.0, "integral": 66.0, "goal": 1.0},
-    "found": {"inlet": 0.8, "sum": 330.0, "integral": 65.0, "outlet": 1.0, "goal": 1.0},
-}  # fmt: skip
+PROVED = Certificate(
+    "proved", "proved", "", start=0.0, intervals=6, seconds=7.25,
+    sampled={"inlet": 0.9, "sum": 333.0, "integral": 66.0, "goal": 1.0},
+    shown={"inlet": 0.8, "sum": 330.0, "integral": 65.0, "outlet": 1.0, "goal": 1.0},
+)  # fmt: skip
+"""As of a run whose elite 000 is proved; test_proofs.py has a real one."""
 VERIFICATION = {
     "states": 1020, "epsilon": 0.0043, "confidence": 0.99, "kept": True,
     "witnesses": {
@@ -113,10 +116,14 @@ def finished(path, plant="pendulum", scale=3.0, **changes):
     return run_folder(path, config, candidate(config), candidate(config, 1, scale))
 
 
-def prove_and_verify(path):
-    """What `rtcd certify`, `rtcd verify` and an experiment leave in the folder."""
+def proved(folder, **certificates):
+    """The run of a folder as if its elite 000 were proved."""
+    return replace(read_run(folder), certificates={"000": PROVED, **certificates})
+
+
+def verify_and_disturb(path):
+    """What `rtcd verify` and an experiment leave in the folder."""
     for place, name, record in (
-        ("certificates", "summary", {"000": CERTIFICATE}),
         ("verification", "000", VERIFICATION),
         ("disturbance", "off_nominal", {"summary": {"initial": {"success": 0.25}, "best": {"success": 0.75}}}),
     ):
