@@ -22,7 +22,7 @@ import numpy as np
 from rtcd_jax.certificate import check
 from rtcd_jax.certificate.check import Damaged, Node, Refused, Report
 from rtcd_jax.certificate.prove.closed_loop import claim_of
-from rtcd_jax.elite.records import read_elite
+from rtcd_jax.elite.elite import Elite
 from rtcd_jax.system.errors import UserError
 from rtcd_jax.system.files import replace_json
 
@@ -69,17 +69,15 @@ def standing(run: Path, name: str, progress: Callable[[int, int], None] = lambda
     """
     if not certificate_path(run, name).is_file():
         return Standing("missing", f"{certificate_path(run, name)} is not there")
-    arrays, record = read_elite(run if name == "initial" else run / "elites", name)
-    return standing_of(certificate_path(run, name), arrays, record, progress)
+    return standing_of(certificate_path(run, name), Elite.read(run, name), progress)
 
 
 def standing_of(
     path: Path,
-    arrays: Mapping[str, np.ndarray],
-    record: Mapping[str, Any],
+    elite: Elite,
     progress: Callable[[int, int], None] = lambda done, of: None,
 ) -> Standing:
-    """What the certificate at `path` is worth for an elite of these arrays and this record."""
+    """What the certificate at `path` is worth for an elite."""
     try:
         file = path.read_bytes()
         content = check.parse(file.decode("ascii"))
@@ -89,7 +87,7 @@ def standing_of(
     except (Refused, UnicodeDecodeError, KeyError, TypeError) as error:
         return Standing("damaged", f"{path} is no certificate: {error}")
     try:
-        other = difference(content["claim"], claim_of(arrays, record))
+        other = difference(content["claim"], claim_of(elite))
     except UserError as error:
         other = str(error)
     if other:

@@ -15,7 +15,7 @@ import jax
 import numpy as np
 import yaml
 
-from rtcd_jax.elite.records import require_elites
+from rtcd_jax.elite.records import elite_name
 from rtcd_jax.export import robot, source, tables
 from rtcd_jax.export.bundle import Bundle, certificate_path, read_bundle
 from rtcd_jax.system.errors import UserError
@@ -37,12 +37,8 @@ def export_run(folder: Path, elite: int | str, target: Path, console: Console) -
     Raises:
         UserError: no run folder, no such elite, one without a funnel, or a target that holds something else.
     """
-    name = elite if isinstance(elite, str) else f"{elite:03d}"
-    there = require_elites(folder)
-    if name != "initial" and name not in there:
-        raise UserError(f"{folder} has no elite {name}; there are {', '.join(there)}")
+    bundle = read_bundle(folder, elite_name(elite))
     former = _claim(target)
-    bundle = read_bundle(folder, name)
     contents = _files(folder, bundle)
     with writing(target):
         target.mkdir(parents=True, exist_ok=True)
@@ -129,7 +125,7 @@ def _parameters(bundle: Bundle, described: Mapping[str, Any]) -> str:
 
 
 def _summary(bundle: Bundle, target: Path, again: bool) -> Iterator[str]:
-    plant, rung, certificate = bundle.elite.plant, bundle.record["rung"], bundle.certificate
+    plant, rung, certificate = bundle.elite.plant, bundle.elite.guarantee, bundle.certificate
     verb = "replaces the former export" if again else "is"
     yield f"{plant}, elite {bundle.name} with its {rung} funnel, {verb} in {target}"
     if certificate:

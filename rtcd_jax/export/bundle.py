@@ -10,12 +10,11 @@ from typing import Any, NamedTuple, final
 
 import jax
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Int
 
 from rtcd_jax.elite.closed_loop import fastest_rate
 from rtcd_jax.elite.elite import Elite
-from rtcd_jax.elite.funnel import Tube
-from rtcd_jax.elite.records import read_elite
+from rtcd_jax.elite.funnel import FunnelInterpolant
 from rtcd_jax.plants import plant_class
 from rtcd_jax.plants.base import Plant
 from rtcd_jax.plants.mjx import CpuDynamics, model_of
@@ -44,43 +43,40 @@ class Instant(NamedTuple):
 class Bundle:
     """An elite with its funnel at every instant, the robot that it is for, and MuJoCo's model of it.
 
-    `joints` [m] says which joint an input drives; `volumes` [knots] are the ellipsoids'.
+    `joints` [m] says which joint an input drives.
     """
 
     name: str
-    tube: Tube
-    record: Mapping[str, Any]
+    funnel: FunnelInterpolant
     certificate: Mapping[str, Any] | None
     plant: Plant
     design: Any
     model: Any
-    volumes: Float[np.ndarray, " knots"]
     joints: Int[np.ndarray, " m"]
 
     @property
     def elite(self) -> Elite:
-        return self.tube.elite
+        return self.funnel.elite
 
     def at(self, t: float) -> Instant:
-        """The loop at a time t >= 0: u* held, K linear, x*, S and rho as in `report.tube`; the goal's from t_N on."""
-        elite, dt, now = self.elite, self.elite.time[1], np.array([t])
-        x, value, level = self.tube.nominal(now)[0], self.tube.value(now)[0], float(self.tube.level(now)[0])
+        """The loop at a time t >= 0: u* held, K linear, x*, S, rho as the funnel has them; the goal's from t_N on."""
+        elite, funnel, dt, now = self.elite, self.funnel, self.elite.time[1], np.array([t])
+        x, value, level = funnel.nominal(now)[0], funnel.value(now)[0], float(funnel.level(now)[0])
         if t >= elite.time[-1]:
             return Instant(x, np.zeros_like(elite.u_max), elite.K_goal, value, level)
         k = min(int(t / dt), len(elite.u) - 1)
-        s = t / dt - k
-        return Instant(x, elite.u[k], (1 - s) * elite.K[k] + s * elite.K[k + 1], value, level)
+        return Instant(x, elite.u[k], funnel.loop.gain(k, t / dt - k), value, level)
 
     def arrays(self) -> dict[str, np.ndarray]:
         """What `controller.npz` holds, SI units."""
         elite = self.elite
         kept = {name: getattr(elite, name) for name in ("time", "x", "u", "K", "S", "rho", "K_goal", "x_goal", "u_max")}
-        more = {"x_rates": self.tube.rates, "S_rates": self.tube.slopes, "state_limits": elite.state_limits}
-        return kept | more | {"input_joints": self.joints}
+        rates = {"x_rates": self.funnel.loop.rates, "S_rates": self.funnel.value_rates}
+        return kept | rates | {"state_limits": elite.state_limits, "input_joints": self.joints}
 
     def describe(self) -> dict[str, Any]:
         """What `controller.json` holds: units, signs, limits, control rate, origin, and what is promised."""
-        elite, record = self.elite, self.record
+        elite, record = self.elite, self.elite.record
         named_states, named_inputs = (record["units"][kind].items() for kind in ("states", "inputs"))
         states = zip(named_states, elite.state_limits, strict=True)
         inputs = zip(named_inputs, elite.u_max, self.joints, strict=True)
@@ -100,7 +96,7 @@ class Bundle:
             "time": {"unit": "s", "knots": elite.time.size, "dt": elite.time[1], "duration": elite.time[-1]},
             "control_rate": {"unit": "Hz", "least": least_rate(self), "rule": RULE},
             "funnel": {
-                "rung": record["rung"],
+                "rung": elite.guarantee,
                 "epsilon": elite.epsilon,
                 "confidence": elite.confidence,
                 "volumes": record["volumes"],
@@ -117,23 +113,17 @@ def read_bundle(folder: Path, name: str) -> Bundle:
     Raises:
         UserError: it is not there, cannot be read or has no funnel.
     """
-    arrays, record = read_elite(folder if name == "initial" else folder / "elites", name)
-    if record.get("status") != "OK":
-        raise UserError(f"{name} has no funnel to export ({record.get('status')}); choose another elite")
-    tube = Tube.of(arrays, record)
-    elite = tube.elite
+    elite = Elite.read(folder, name)
     with jax.enable_x64(True):
         plant, design = plant_class(elite.plant).from_parameters(elite.parameters)
     model = model_of(elite.plant, elite.parameters)
     return Bundle(
         name=name,
-        tube=tube,
-        record=record,
+        funnel=FunnelInterpolant.of(elite),
         certificate=_certificate(folder, name, elite),
         plant=plant,
         design=design,
         model=model,
-        volumes=arrays["volumes_per_knot"],
         joints=model.actuator_trnid[:, 0].copy(),
     )
 

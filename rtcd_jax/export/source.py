@@ -39,11 +39,11 @@ def data_header(bundle: Bundle) -> str:
     elite = bundle.elite
     arrays = {
         "X": elite.x,
-        "X_RATES": bundle.tube.rates,
+        "X_RATES": bundle.funnel.loop.rates,
         "U": elite.u,
         "K": elite.K,
         "S": elite.S,
-        "S_RATES": bundle.tube.slopes,
+        "S_RATES": bundle.funnel.value_rates,
         "LOG_RHO": np.log(elite.rho),
         "K_GOAL": elite.K_goal,
         "X_GOAL": elite.x_goal,
@@ -86,9 +86,8 @@ def readme(bundle: Bundle, described: dict[str, Any]) -> str:
 
 
 def _header(bundle: Bundle, guard: str, lines: list[str]) -> str:
-    source = (
-        f"/* {bundle.elite.plant}, elite {bundle.name}, configuration {bundle.record['config_hash']}. Generated. */"
-    )
+    elite = bundle.elite
+    source = f"/* {elite.plant}, elite {bundle.name}, configuration {elite.record['config_hash']}. Generated. */"
     return "\n".join([source, f"#ifndef {guard}", f"#define {guard}", "", *lines, "", "#endif", ""])
 
 

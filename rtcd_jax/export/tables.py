@@ -4,6 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from rtcd_jax.elite.elite import ellipsoid_axes
 from rtcd_jax.export.bundle import Bundle
 
 VECTORS = 400
@@ -40,8 +41,8 @@ def funnel(bundle: Bundle) -> str:
     elite, n = bundle.elite, bundle.elite.x_goal.size
     upper = np.triu_indices(n)
     names = [f"S{i + 1}{j + 1}" for i, j in zip(*upper, strict=True)]
-    header = ["time", "rho", f"volume_{bundle.record['rung']}", *names]
-    return csv(header, elite.time, elite.rho, bundle.volumes, elite.S[:, *upper])
+    header = ["time", "rho", f"volume_{elite.guarantee}", *names]
+    return csv(header, elite.time, elite.rho, elite.volumes_per_knot, elite.S[:, *upper])
 
 
 def vectors(bundle: Bundle) -> str:
@@ -53,8 +54,7 @@ def vectors(bundle: Bundle) -> str:
         now = bundle.at(t)
         direction = random.normal(size=n)
         reach = FARTHEST * random.uniform()
-        axes = np.sqrt(now.level) * np.linalg.inv(np.linalg.cholesky(now.value)).T
-        error = axes @ (reach * direction / np.linalg.norm(direction))
+        error = ellipsoid_axes(now.value, np.asarray(now.level)) @ (reach * direction / np.linalg.norm(direction))
         u = np.clip(now.u - now.gain @ error, -elite.u_max, elite.u_max)
         rows.append([t, *(now.x + error), *u, reach**2])
     header = ["time", *(f"x{i + 1}" for i in range(n)), *(f"u{j + 1}" for j in range(m)), "V_over_rho"]

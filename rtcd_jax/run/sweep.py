@@ -153,8 +153,7 @@ def show(cases: Sequence[Case], folder: Path) -> str:
 
 
 def _row(case: Case) -> dict[str, Any]:
-    volumes = {name: _volumes(case.folder, name) for name in ("initial", "elites/000")}
-    initial, best = volumes.values()
+    initial, best = (_volumes(case.folder, name) for name in ("initial", "000"))
     objective = case.config.search.objective
     ratio = best[objective] / initial[objective] if best and initial and initial[objective] > 0 else None
     return {
@@ -175,7 +174,9 @@ def _generations(folder: Path) -> int:
 
 
 def _volumes(folder: Path, name: str) -> dict[str, float]:
-    record = folder / f"{name}.json"
+    from rtcd_jax.elite.records import elite_folder
+
+    record = elite_folder(folder, name) / f"{name}.json"
     advice = "restore it, or make the run again"
     with reading(record, advice):
         return read_json(record, advice)["volumes"] if record.is_file() else {}

@@ -7,6 +7,7 @@ import pytest
 
 from rtcd_jax.certificate import check, standing
 from rtcd_jax.certificate.standing import Standing, standing_of
+from rtcd_jax.elite.elite import Elite
 from tests.certificate import swing
 from tests.certificate.test_check import nudged, resealed
 
@@ -27,7 +28,7 @@ def unremembered(tmp_path, monkeypatch):
 def intervals_checked(path, stored):
     """The verdict, and how many intervals the checker went through for it."""
     done = []
-    return standing_of(path, *stored, lambda k, of: done.append(k)), len(done)
+    return standing_of(path, Elite.of(*stored), lambda k, of: done.append(k)), len(done)
 
 
 def test_a_proved_elite(run, content):
@@ -63,7 +64,7 @@ OTHERS = {
 
 
 def _shorten(arrays):
-    arrays.update({key: arrays[key][1:] for key in ("time", "x", "u", "K", "S", "rho")})
+    arrays.update({key: arrays[key][1:] for key in ("time", "x", "u", "K", "S", "rho", "volumes_per_knot")})
 
 
 @pytest.mark.parametrize("change", OTHERS)
@@ -73,7 +74,7 @@ def test_an_elite_with_another_number_is_not_proved(path, change):
     record = {key: value.copy() if isinstance(value, dict | list) else value for key, value in record.items()}
     changed, told = OTHERS[change]
     changed(arrays, record)
-    found = standing_of(path, arrays, record)
+    found = standing_of(path, Elite.of(arrays, record))
     assert found.verdict == "of another elite"
     assert f"{path} is of another elite: {told}" in found.reason
     assert not found.proved
@@ -84,10 +85,10 @@ def test_rates_may_differ_by_their_rounding_alone(path, content):
     """A claim's rates are sines of another machine; a resealed last bit is another claim, but of the same elite."""
     content["claim"]["rates"][1][0][1] = nudged(content["claim"]["rates"][1][0][1], 2.0**-52)
     path.write_text(json.dumps(resealed(content)))
-    assert standing_of(path, *swing.elite()).verdict == "proved"
+    assert standing_of(path, Elite.of(*swing.elite())).verdict == "proved"
     content["claim"]["rates"][1][0][1] = nudged(content["claim"]["rates"][1][0][1], 1e-9)
     path.write_text(json.dumps(resealed(content)))
-    assert "rates[1][0][1] = " in standing_of(path, *swing.elite()).reason
+    assert "rates[1][0][1] = " in standing_of(path, Elite.of(*swing.elite())).reason
 
 
 DAMAGED = {
@@ -110,13 +111,13 @@ def _changed(text, container):
 @pytest.mark.parametrize("damage", DAMAGED)
 def test_a_damaged_file_proves_nothing(path, text, damage):
     path.write_text(DAMAGED[damage](text), "utf-8")
-    assert standing_of(path, *swing.elite()).verdict == "damaged"
+    assert standing_of(path, Elite.of(*swing.elite())).verdict == "damaged"
 
 
 def test_a_refused_file_proves_nothing(path, content):
     content["goal"]["shells"][0]["cases"]["free"]["gram"][0][0] = "-0x1.0p+0"
     path.write_text(json.dumps(resealed(content)))
-    found = standing_of(path, *swing.elite())
+    found = standing_of(path, Elite.of(*swing.elite()))
     assert (found.verdict, found.sha256) == ("refused", "")
     assert "is not positive definite" in found.reason
 
@@ -133,18 +134,18 @@ def test_a_verdict_is_remembered_by_the_user_not_by_the_run(path, content, unrem
 
 def test_what_is_remembered_of_one_file_says_nothing_of_another(path, content, unremembered):
     stored = swing.elite()
-    assert standing_of(path, *stored).proved
+    assert standing_of(path, Elite.of(*stored)).proved
     content["funnel"][1]["cases"]["free"]["gram"][0][0] = "-0x1.0p+0"
     path.write_text(json.dumps(resealed(content)))
-    assert standing_of(path, *stored).verdict == "refused"
+    assert standing_of(path, Elite.of(*stored)).verdict == "refused"
     path.unlink()
-    assert standing_of(path, *stored).verdict == "missing"
+    assert standing_of(path, Elite.of(*stored)).verdict == "missing"
 
 
 @pytest.mark.parametrize("rest", ["", "{", "[]", '{"verdict": "proved", "more": 1}'])
 def test_a_torn_memory_is_none(path, content, unremembered, tmp_path, rest):
     stored = swing.elite()
-    first = standing_of(path, *stored)
+    first = standing_of(path, Elite.of(*stored))
     (memory,) = (tmp_path / "empty").rglob("*.json")
     memory.write_text(rest)
     assert intervals_checked(path, stored) == (first, len(content["funnel"]))
@@ -152,5 +153,5 @@ def test_a_torn_memory_is_none(path, content, unremembered, tmp_path, rest):
 
 def test_without_a_cache_it_is_decided_anew(path, monkeypatch):
     monkeypatch.setenv("XDG_CACHE_HOME", "/dev/null")
-    assert standing_of(path, *swing.elite()).proved
+    assert standing_of(path, Elite.of(*swing.elite())).proved
     assert intervals_checked(path, swing.elite())[1] > 0

@@ -7,8 +7,8 @@ import subprocess
 import numpy as np
 import pytest
 
-from rtcd_jax.elite.closed_loop import Outcome, _outside, holding, runge_kutta, settling_time, simulate, tracking
-from rtcd_jax.elite.simulators import witnesses
+from rtcd_jax.elite.closed_loop import ClosedLoop, Outcome, _outside, runge_kutta, settling_time, simulate
+from rtcd_jax.elite.simulators import simulators_of
 
 STEPS = 10  # in an interval
 SETTLING_STEPS = 4
@@ -79,10 +79,10 @@ def around_the_funnel(bundle, count, reach, seed):
 
 def test_the_input_is_that_of_the_verifications_loop(export, loop):
     elite, control = export.bundle.elite, loop[0]
-    f = next(witnesses(elite, 2)).dynamics
+    loop_of = ClosedLoop.of(elite, next(simulators_of(elite, 2)).dynamics)
     for t, x, _ in around_the_funnel(export.bundle, 200, reach=3, seed=0):
         k = int(t / elite.time[1])
-        policy = tracking(elite, f, k) if t < elite.time[-1] else holding(elite)
+        policy = loop_of.tracking(k) if t < elite.time[-1] else loop_of.holding()
         np.testing.assert_allclose(control(t, x), policy(t, x[None])[0], rtol=1e-8, atol=1e-8)
 
 
@@ -150,14 +150,14 @@ def test_before_the_start_its_first_instant_is_held(export, loop):
 def test_c_mujoco_under_the_exported_controller_gives_the_verifications_outcome(export, loop):
     """The same states, half of them far outside the funnel, step by step: the same verdicts on every one."""
     elite, (control, monitor) = export.bundle.elite, loop
-    witness = next(witnesses(elite, 24))
+    simulator = next(simulators_of(elite, 24))
     knots, states = elite.sample(24, np.random.default_rng(3))
     states[::2] = elite.x[knots[::2]] + 4 * (states[::2] - elite.x[knots[::2]])
-    march = runge_kutta(witness.dynamics, elite.time[1] / STEPS)
-    expected = simulate(elite, witness.dynamics, march, knots, states)
+    march = runge_kutta(simulator.dynamics, elite.time[1] / STEPS)
+    expected = simulate(elite, simulator.dynamics, march, knots, states)
     assert 0 < expected.failed.sum() < len(states)
 
-    exported = _driven(elite, control, monitor, march, witness.dynamics, knots, states)
+    exported = _driven(elite, control, monitor, march, simulator.dynamics, knots, states)
     for kind in ("left_funnel", "left_limits", "missed_goal"):
         np.testing.assert_array_equal(getattr(exported, kind), getattr(expected, kind))
 

@@ -169,7 +169,7 @@ def test_an_elite_that_is_not_there_is_answered_with_those_that_are(run, tmp_pat
 
 def test_a_candidate_without_a_funnel_is_not_exported(tmp_path):
     run = run_folder(tmp_path / "run", "pendulum", status="FUNNEL_EMPTY")
-    with pytest.raises(UserError, match=r"initial has no funnel to export \(FUNNEL_EMPTY\)"):
+    with pytest.raises(UserError, match=r"initial has no funnel \(FUNNEL_EMPTY\)"):
         export_run(run, "initial", tmp_path / "lab", Silent())
 
 

@@ -1,4 +1,4 @@
-"""`rtcd replay`: was a measured run inside the funnel? V/rho of every sample, by the funnel of `tube.py`."""
+"""`rtcd replay`: was a measured run inside the funnel? V/rho of every sample, by the funnel between its knots."""
 
 import csv
 import io
@@ -13,11 +13,12 @@ from jaxtyping import Bool, Float
 from rtcd_jax.analysis.replay.measured import Measured, jumps, read_measured
 from rtcd_jax.analysis.report.canvas import BLACK, GRAY, LIGHT, WIDTH, blank, written
 from rtcd_jax.analysis.report.funnels import draw_shadows, frame, told_once, window
-from rtcd_jax.analysis.report.reading import BLUE, VERMILION, Shown
+from rtcd_jax.analysis.report.reading import BLUE, VERMILION, FunnelView
 from rtcd_jax.analysis.report.shapes import planes
 from rtcd_jax.config.load import Config
-from rtcd_jax.elite.funnel import Tube
-from rtcd_jax.elite.records import read_config, read_elite, require_elites
+from rtcd_jax.elite.elite import Elite
+from rtcd_jax.elite.funnel import FunnelInterpolant
+from rtcd_jax.elite.records import elite_name, read_config
 from rtcd_jax.system.errors import UserError
 from rtcd_jax.system.files import make_folder, replace, replace_json
 
@@ -35,13 +36,13 @@ class Replay:
     """A measured motion with V/rho of every sample; inside means at most 1."""
 
     measured: Measured
-    fill: Float[np.ndarray, " T"]
-    elite: str
-    record: Mapping[str, Any]
+    ratio: Float[np.ndarray, " T"]
+    name: str
+    elite: Elite
 
     @property
     def inside(self) -> Bool[np.ndarray, " T"]:
-        return self.fill <= 1
+        return self.ratio <= 1
 
     @property
     def kept(self) -> bool:
@@ -50,25 +51,25 @@ class Replay:
     def sample(self, k: int) -> dict[str, Any]:
         """One sample as JSON stores it."""
         state = dict(zip(self.measured.columns[1:], self.measured.x[k], strict=True))
-        return {"time": self.measured.time[k], "V/rho": self.fill[k], "state": state}
+        return {"time": self.measured.time[k], "V/rho": self.ratio[k], "state": state}
 
     def told(self) -> dict[str, Any]:
         """As JSON stores it: `closest` is the sample with the smallest margin 1 - V/rho."""
         first = None if self.kept else self.sample(int(np.argmin(self.inside)))
         return {
-            "elite": self.elite,
-            "samples": len(self.fill),
+            "elite": self.name,
+            "samples": len(self.ratio),
             "inside": self.kept,
             "share_inside": float(self.inside.mean()),
             "first_exit": first,
-            "closest": self.sample(int(self.fill.argmax())),
-            "smallest_margin": 1 - float(self.fill.max()),
-            "rung": self.record["rung"],
-            "config_hash": self.record.get("config_hash"),
+            "closest": self.sample(int(self.ratio.argmax())),
+            "smallest_margin": 1 - float(self.ratio.max()),
+            "rung": self.elite.guarantee,
+            "config_hash": self.elite.record.get("config_hash"),
         }
 
 
-def replay_run(folder: Path, file: Path, elite: int | str, console: Console) -> bool:
+def replay_run(folder: Path, file: Path, which: int | str, console: Console) -> bool:
     """Replays a measured file against the funnel of an elite, or of the candidate "initial"; True if it stayed inside.
 
     Writes `replay/NAME_ELITE.csv`, `.json`, `.png` and `.pdf`, NAME that of the measured file.
@@ -77,18 +78,16 @@ def replay_run(folder: Path, file: Path, elite: int | str, console: Console) -> 
         UserError: no run folder, no such elite, a file that is no measured motion, or a folder that cannot be written.
     """
     config = read_config(folder)
-    name, place = (f"{elite:03d}", folder / "elites") if isinstance(elite, int) else (elite, folder)
-    require_elites(folder)
-    arrays, record = read_elite(place, name)
-    tube = Tube.of(arrays, record)
-    measured = read_measured(file, arrays["x"].shape[1])
-    _check_time(file, measured, float(tube.elite.time[-1]))
-    replay = Replay(measured, tube.fill(measured.time, measured.x), name, record)
+    name, elite = elite_name(which), Elite.read(folder, which)
+    measured = read_measured(file, elite.x_goal.size)
+    _check_time(file, measured, float(elite.time[-1]))
+    ratio = FunnelInterpolant.of(elite).ratio(measured.time, measured.x)
+    replay = Replay(measured, ratio, name, elite)
     results, stem = folder / "replay", f"{file.stem}_{name}"
     make_folder(results)
     replace(results / f"{stem}.csv", _table(replay).encode())
     replace_json(results / f"{stem}.json", {"file": str(file), **replay.told()})
-    _draw(config, Shown.of(f"funnel of {name}", VERMILION, arrays, record), replay, results, stem)
+    _draw(config, FunnelView(f"funnel of {name}", VERMILION, elite), replay, results, stem)
     for line in [*jumps(measured, list(config.plant.states.values())), *_summary(replay)]:
         console.message(line)
     console.message(f"V/rho of every sample, and its figure: {results / stem}.csv, .json, .png, .pdf")
@@ -124,15 +123,15 @@ def _table(replay: Replay) -> str:
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow([*replay.measured.columns, "V/rho", "inside"])
-    rows = np.column_stack([replay.measured.time, replay.measured.x, replay.fill]).tolist()
+    rows = np.column_stack([replay.measured.time, replay.measured.x, replay.ratio]).tolist()
     writer.writerows([*map(repr, row), int(row[-1] <= 1)] for row in rows)
     return text.getvalue()
 
 
-def _draw(config: Config, funnel: Shown, replay: Replay, folder: Path, name: str) -> None:
+def _draw(config: Config, funnel: FunnelView, replay: Replay, folder: Path, name: str) -> None:
     pairs = planes(replay.measured.x.shape[1])
     with blank((WIDTH, 3.2 * len(pairs) + 2.2)) as figure:
-        *panels, fill = figure.subplots(len(pairs) + 1, 1, height_ratios=[3.2] * len(pairs) + [2.2])
+        *panels, ratio = figure.subplots(len(pairs) + 1, 1, height_ratios=[3.2] * len(pairs) + [2.2])
         for axes, plane in zip(panels, pairs, strict=True):
             draw_shadows(axes, [funnel], plane)
             motion = replay.measured.x[:, plane]
@@ -142,9 +141,9 @@ def _draw(config: Config, funnel: Shown, replay: Replay, folder: Path, name: str
             view = np.stack([np.minimum(low, motion.min(0)), np.maximum(high, motion.max(0))])
             frame(axes, config, plane, view)
         figure.legend(**told_once(panels), loc="outside upper center")
-        fill.semilogy(replay.measured.time, np.maximum(replay.fill, LEAST), color=BLUE)
-        fill.axhline(1, color=BLACK, lw=1, ls="--")
-        fill.axvline(float(funnel.time[-1]), color=GRAY, lw=1, ls=":")
-        fill.set(xlabel="time [s]", ylabel="V/ρ [-]")
-        fill.grid(axis="y", lw=0.4, color=LIGHT)
+        ratio.semilogy(replay.measured.time, np.maximum(replay.ratio, LEAST), color=BLUE)
+        ratio.axhline(1, color=BLACK, lw=1, ls="--")
+        ratio.axvline(float(funnel.elite.time[-1]), color=GRAY, lw=1, ls=":")
+        ratio.set(xlabel="time [s]", ylabel="V/ρ [-]")
+        ratio.grid(axis="y", lw=0.4, color=LIGHT)
         written(figure, folder, name)

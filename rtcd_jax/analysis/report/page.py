@@ -103,7 +103,7 @@ def _header(runs: Sequence[Run]) -> str:
         told = f'<p class="candidate">{_candidate(runs[0])}</p>'
     else:
         cards = "".join(
-            _card(run.name, f"× {_told(_gain(run, 'sum'))}", f"sum over its initial one, {run.best.record['rung']}")
+            _card(run.name, f"× {_told(_gain(run, 'sum'))}", f"sum over its initial one, {run.best.guarantee}")
             for run in runs
         )
         told = ""
@@ -125,7 +125,7 @@ def _headlines(run: Run) -> Iterator[tuple[str, str, str]]:
     objective = run.config.search.objective
     for name in dict.fromkeys((objective, "sum", "inlet")):
         searched = ", searched" if name == objective else ""
-        yield f"{words(name)} over initial", f"× {_told(_gain(run, name))}", run.best.record["rung"] + searched
+        yield f"{words(name)} over initial", f"× {_told(_gain(run, name))}", run.best.guarantee + searched
     yield "swing-up", duration(float(run.best.time[-1])), "of the best, start to goal"
     found = run.certificates.get("000")
     if found is None:

@@ -8,12 +8,19 @@ from pathlib import Path
 from typing import Any, final
 
 import numpy as np
-from jaxtyping import Float
 
 from rtcd_jax.analysis.report.words import VOLUMES
 from rtcd_jax.certificate.standing import certificate_path, standing
 from rtcd_jax.config.load import Config
-from rtcd_jax.elite.records import elite_names, read_config, read_elite, read_generations, require_elites
+from rtcd_jax.elite.elite import Elite, initial_and_best
+from rtcd_jax.elite.records import (
+    INITIAL,
+    elite_folder,
+    elite_names,
+    read_config,
+    read_elite,
+    read_generations,
+)
 from rtcd_jax.system.console import Console, silent
 from rtcd_jax.system.errors import UserError
 from rtcd_jax.system.files import read_json, reading
@@ -34,33 +41,12 @@ _OF_A_GENERATION = (
 
 @final
 @dataclass(frozen=True)
-class Shown:
-    """What reports tell of one funnel: arrays as in the run folder, `volumes` by name, `record` beside them.
-
-    `label` and `color` are its own in all panels.
-    """
+class FunnelView:
+    """A funnel as it is drawn; `label` and `color` are its own in all panels."""
 
     label: str
     color: str
-    time: Float[np.ndarray, " knots"]
-    x: Float[np.ndarray, "knots n"]
-    S: Float[np.ndarray, "knots n n"]
-    rho: Float[np.ndarray, " knots"]
-    per_knot: Float[np.ndarray, " knots"]
-    volumes: Mapping[str, float]
-    record: Mapping[str, Any]
-
-    @classmethod
-    def of(cls, label: str, color: str, arrays: Mapping[str, np.ndarray], record: Mapping[str, Any]) -> "Shown":
-        """A funnel from its stored arrays and record. Raises UserError if something is missing."""
-        needed = ["time", "x", "S", "rho", "volumes_per_knot", *(f"volumes_{name}" for name in VOLUMES)]
-        missing = [name for name in needed if name not in arrays]
-        missing += [name for name in ("design", "weights", "rung") if name not in record]
-        if missing:
-            raise UserError(f"the {label} candidate lacks {', '.join(missing)}")
-        volumes = {name: float(arrays[f"volumes_{name}"]) for name in VOLUMES}
-        shapes = {name: arrays[name] for name in ("time", "x", "S", "rho")}
-        return cls(label, color, **shapes, per_knot=arrays["volumes_per_knot"], volumes=volumes, record=record)
+    elite: Elite
 
 
 @final
@@ -110,15 +96,16 @@ class Checking:
 class Run:
     """A run folder. `initial` is None where the initial candidate has no funnel, and `absence` says why.
 
-    `figures` is the folder that they are drawn into.
+    `figures` is the folder that they are drawn into; `labels` are those of the initial and of the best funnel, and
+    `color` is the best one's.
     """
 
     path: Path
     figures: Path
     name: str
     config: Config
-    best: Shown
-    initial: Shown | None
+    best: Elite
+    initial: Elite | None
     absence: str
     generations: Sequence[Mapping[str, Any]]
     elites: Mapping[str, Mapping[str, Any]]
@@ -126,11 +113,14 @@ class Run:
     verification: Mapping[str, Mapping[str, Any]]
     experiments: Sequence[Experiment]
     provenance: Mapping[str, Any]
+    labels: tuple[str, str] = ("initial", "best")
+    color: str = VERMILION
 
     @property
-    def funnels(self) -> list[Shown]:
+    def funnels(self) -> list[FunnelView]:
         """The initial one, if there is one, and the best."""
-        return [self.best] if self.initial is None else [self.initial, self.best]
+        best = FunnelView(self.labels[1], self.color, self.best)
+        return [best] if self.initial is None else [FunnelView(self.labels[0], BLUE, self.initial), best]
 
     @property
     def seconds(self) -> float | None:
@@ -146,19 +136,20 @@ def read_run(path: Path, console: Console | None = None) -> Run:
         UserError: no run folder, no elites yet, an elite without a funnel or with something missing, or a file that
             cannot be read.
     """
-    config, best = read_config(path), read_best(path)
-    initial, absence = read_initial(path)
-    folder = path / "elites"
+    config = read_config(path)
+    funnels, absence = initial_and_best(path)
+    for name, elite in funnels.items():
+        _require_shown(name, elite)
     return Run(
         path=path,
         figures=path / "figures",
         name=path.resolve().name,
         config=config,
-        best=best,
-        initial=initial,
+        best=funnels["best"],
+        initial=funnels.get(INITIAL),
         absence=absence,
         generations=read_search(path),
-        elites={name: read_elite(folder, name)[1] for name in elite_names(path)},
+        elites={name: read_elite(elite_folder(path, name), name)[1] for name in elite_names(path)},
         certificates=dict(_certificates(path, console or silent())),
         verification={file.stem: _json(file) for file in sorted((path / "verification").glob("*.json"))},
         experiments=tuple(_experiments(path / "disturbance")),
@@ -166,23 +157,12 @@ def read_run(path: Path, console: Console | None = None) -> Run:
     )
 
 
-def read_best(path: Path) -> Shown:
-    """The best elite. Raises UserError if there is none, or it has no funnel."""
-    require_elites(path)
-    arrays, record = read_elite(path / "elites", "000")
-    if record.get("status") != "OK":
-        raise UserError(f"{path / 'elites'}: 000 has no funnel ({record.get('status')})")
-    return Shown.of("best", VERMILION, arrays, record)
-
-
-def read_initial(path: Path) -> tuple[Shown | None, str]:
-    """The initial candidate's funnel, or None and the reason."""
-    if not (path / "initial.json").is_file():
-        return None, "no initial candidate was stored"
-    arrays, record = read_elite(path, "initial")
-    if record.get("status") != "OK":
-        return None, f"the initial candidate has no funnel ({record.get('status')})"
-    return Shown.of("initial", BLUE, arrays, record), ""
+def _require_shown(name: str, elite: Elite) -> None:
+    """Raises UserError where something is missing that reports tell of a candidate."""
+    missing = [f"volumes_{volume}" for volume in VOLUMES if volume not in elite.volumes]
+    missing += [key for key in ("design", "weights") if key not in elite.record]
+    if missing:
+        raise UserError(f"the {name} candidate lacks {', '.join(missing)}")
 
 
 def read_search(path: Path) -> list[dict[str, Any]]:
@@ -210,25 +190,25 @@ def compared(runs: Sequence[Run]) -> list[Run]:
     found: list[Run] = []
     for index, run in enumerate(runs):
         name = run.name if names.count(run.name) == 1 else str(run.path)
-        best = replace(run.best, label=name, color=COLORS[index % len(COLORS)])
-        initial = run.initial and replace(run.initial, label=f"{name}, initial")
-        found.append(replace(run, name=name, best=best, initial=initial))
+        color = COLORS[index % len(COLORS)]
+        found.append(replace(run, name=name, labels=(f"{name}, initial", name), color=color))
     return found
 
 
-def shown(runs: Sequence[Run]) -> list[Shown]:
+def shown(runs: Sequence[Run]) -> list[FunnelView]:
     """The funnels that are drawn over one another: what the runs have in common, their initial candidate, once."""
-    initials: list[Shown] = []
+    initials: list[FunnelView] = []
     for run in runs:
-        if run.initial and not any(_same(run.initial, other) for other in initials):
-            initials.append(run.initial)
+        for initial in run.funnels[:-1]:
+            if not any(_same(initial.elite, other.elite) for other in initials):
+                initials.append(initial)
     if len(initials) == 1:
         initials = [replace(initials[0], label="initial")]
     colors = itertools.cycle(INITIALS)
-    return [*(replace(initial, color=next(colors)) for initial in initials), *(run.best for run in runs)]
+    return [*(replace(initial, color=next(colors)) for initial in initials), *(run.funnels[-1] for run in runs)]
 
 
-def _same(first: Shown, second: Shown) -> bool:
+def _same(first: Elite, second: Elite) -> bool:
     """Whether two funnels are one candidate's: the same motion and values, however their levels were sampled."""
     return first.x.shape == second.x.shape and np.allclose(first.x, second.x) and np.allclose(first.S, second.S)
 

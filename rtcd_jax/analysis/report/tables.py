@@ -135,7 +135,7 @@ def _gains_of(run: Run) -> Iterator[tuple[Cell, ...]]:
         before, after = run.initial.volumes[name] if run.initial else None, run.best.volumes[name]
         label = f"{words(name)} (searched)" if name == searched else words(name)
         times = ratio(after, before) if before is not None else None
-        yield label, volume_unit(run.config, name), before, after, times, told_time(run), run.best.record["rung"]
+        yield label, volume_unit(run.config, name), before, after, times, told_time(run), run.best.guarantee
     found = run.certificates.get("000")
     for name in order:
         if found and name in found.shown:

@@ -8,7 +8,8 @@ import pytest
 
 from rtcd_jax.analysis.replay.measured import columns_of, jumps, read_measured
 from rtcd_jax.analysis.replay.replay import replay_run
-from rtcd_jax.elite.funnel import Tube
+from rtcd_jax.elite.elite import Elite
+from rtcd_jax.elite.funnel import FunnelInterpolant
 from rtcd_jax.elite.records import write_elite
 from rtcd_jax.system.errors import UserError
 from tests.analysis.report.loops import LOOPS, loop_folder, stored
@@ -27,11 +28,11 @@ class Said:
 def motion(plant, scale, samples=41, after=0.05):
     """Times beyond the last knot, and states at sqrt(V/rho) = scale(t) along a fixed direction."""
     arrays, record = stored(plant)
-    tube = Tube.of(arrays, record)
+    funnel = FunnelInterpolant.of(Elite.of(arrays, record))
     time = np.linspace(0, arrays["time"][-1] + after, samples)
     direction = np.ones(arrays["x"].shape[1])
-    lengths = np.sqrt(tube.level(time) / np.einsum("i,tij,j->t", direction, tube.value(time), direction))
-    return time, tube.nominal(time) + (scale(time) * lengths)[:, None] * direction
+    lengths = np.sqrt(funnel.level(time) / np.einsum("i,tij,j->t", direction, funnel.value(time), direction))
+    return time, funnel.nominal(time) + (scale(time) * lengths)[:, None] * direction
 
 
 def measured_file(path, plant, time, x):
@@ -155,7 +156,7 @@ def test_a_file_that_is_no_text_is_refused(tmp_path):
 def test_a_run_that_cannot_be_replayed_is_refused(tmp_path, figures):
     folder = loop_folder(tmp_path / "run", "pendulum")
     path = measured_file(tmp_path / "lab.csv", "pendulum", *motion("pendulum", lambda t: 0 * t))
-    with pytest.raises(UserError, match=r"has no 003.npz with its 003.json; there is 000"):
+    with pytest.raises(UserError, match=r"has no elite 003; there are 000"):
         replay_run(folder, path, 3, Said())
     with pytest.raises(UserError, match="is no run folder"):
         replay_run(tmp_path, path, 0, Said())

@@ -56,17 +56,27 @@ def candidate(config, seed=0, scale=1.0, **changes):
     """A funnel as a run stores it: from start to goal, its ellipsoids random; the volumes are marks, not measured."""
     S, rho = random_values(len(config.task.start), seed)
     start, goal = np.array(config.task.start), np.array(config.task.goal)
-    per_knot = scale * np.geomspace(0.01, 10, KNOTS)
+    per_knot, n = scale * np.geomspace(0.01, 10, KNOTS), len(start)
     volumes = {"sum": 111.0, "integral": 22.0, "inlet": 0.3, "geometric_mean": 4.0}
     arrays = {
         "time": 0.1 * scale * np.arange(KNOTS),
         "x": start + (goal - start) * np.linspace(0, 1, KNOTS)[:, None],
+        "u": np.zeros((KNOTS - 1, 1)),
+        "K": np.zeros((KNOTS, 1, n)),
         "S": S,
         "rho": scale * rho,
+        "Q": np.eye(n),
+        "R": np.eye(1),
+        "K_goal": np.zeros((1, n)),
+        "x_goal": goal,
+        "u_max": np.ones(1),
         **{f"volumes_{name}": np.array(value * scale) for name, value in volumes.items()},
         "volumes_per_knot": per_knot,
     }
     record = {
+        "plant": config.plant.name,
+        "parameters": {},
+        "state_limits": [limit if np.isfinite(limit) else None for limit in config.task.state_limits],
         "status": "OK",
         "design": {name: variable.initial for name, variable in config.design.items()},
         "weights": {letter: [variable.initial for variable in found] for letter, found in config.weights},

@@ -161,7 +161,7 @@ def test_compared_searches_show_best_median_and_feasible_share_over_their_candid
     ]  # fmt: skip
     assert [line["y"] for line in data[3:]] == [[100.0, 101.0, 102.0], [60.0] * 3, [0.75] * 3]
     assert all(line["x"] == [4, 8, 12] for line in data)
-    assert {line["line"]["color"] for line in data[3:]} == {runs[1].best.color}
+    assert {line["line"]["color"] for line in data[3:]} == {runs[1].color}
 
 
 def test_one_run_gets_its_page_and_figures_several_get_one_beside_them(tmp_path, figures):

@@ -71,8 +71,8 @@ def test_what_is_no_finished_run_is_refused(tmp_path):
     with pytest.raises(UserError, match=r"000 has no funnel \(FUNNEL_EMPTY\)"):
         read_run(failed)
     arrays, record = candidate(config)
-    del arrays["rho"], arrays["volumes_inlet"], record["design"]
-    with pytest.raises(UserError, match="the best candidate lacks rho, volumes_inlet, design"):
+    del arrays["volumes_inlet"], record["design"]
+    with pytest.raises(UserError, match="the best candidate lacks volumes_inlet, design"):
         read_run(run_folder(tmp_path / "poor", config, best=(arrays, record)))
     damaged = verify_and_disturb(finished(tmp_path / "damaged"))
     (damaged / "certificates").mkdir()
