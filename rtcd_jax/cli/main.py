@@ -228,7 +228,7 @@ def export(arguments: Sequence[str]) -> int:
     from rtcd_jax.system.console import Console
 
     with Console() as console:
-        export_run(options.run, options.elite, options.to, console)
+        export_run(options.run, options.elite, options.to, console, options.name)
     return OK
 
 

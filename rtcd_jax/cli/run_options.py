@@ -95,6 +95,10 @@ class ExportOptions:
     elite: Annotated[
         int | Literal["initial"], tyro.conf.arg(metavar="K", help="0 is the best [-] (>= 0); or initial")
     ] = 0
+    name: Annotated[
+        str | None,
+        tyro.conf.arg(metavar="NAME", help="of the controller's files and C symbols; by default ROBOT_ELITE"),
+    ] = None
 
 
 def read_verify(arguments: Sequence[str]) -> VerifyOptions:
