@@ -48,14 +48,16 @@ weights:
 """
 """The shortest complete YAML: the paper's pendulum with the default settings."""
 
+SMALLEST_DESIGN, SMALLEST_WEIGHT = 1e-6, 1e-9
+
 
 class Config(Settings):
     """Everything that defines a run."""
 
     plant: Annotated[SerializeAsAny[PlantConfig], PlainValidator(read_plant)] = Field(description="the robot")
     task: TaskConfig = Field(description="from where to where, and within what")
-    design: dict[str, Variable] = Field(description="the plant's design fields by name")
-    weights: WeightsConfig = Field(description="cost weights, searched on a log scale")
+    design: dict[str, Variable] = Field(description="the plant's design fields by name, all >= 1e-6")
+    weights: WeightsConfig = Field(description="cost weights >= 1e-9, searched on a log scale")
     trajectory: TrajectoryConfig = Field(default=TrajectoryConfig(), description="the nominal motion")
     policy: PolicyConfig = Field(default=PolicyConfig(), description="the controller that tracks it")
     funnel: FunnelConfig = Field(default=FunnelConfig(), description="how the funnel is sampled")
@@ -97,11 +99,16 @@ def _size(path: tuple[str, ...], values: tuple, names: Collection[str]) -> Itera
         yield Problem(path, f"must have {len(names)} {plural} ({', '.join(names)}), has {len(values)}")
 
 
-def _ends(task: TaskConfig) -> Iterator[Problem]:
+def _ends(task: TaskConfig, trajectory: TrajectoryConfig) -> Iterator[Problem]:
+    share = trajectory.limit_share
     for key in ("start", "goal"):
         for i, (value, limit) in enumerate(zip(getattr(task, key), task.state_limits, strict=False)):
-            if abs(value) > limit:
-                yield Problem(("task", key, i), f"must lie in [-{limit:g}, {limit:g}] (task.state_limits)", value)
+            if abs(value) >= limit:
+                text = f"must lie between -{limit:g} and {limit:g} (task.state_limits): on a limit there is no funnel"
+                yield Problem(("task", key, i), text, value)
+            elif abs(value) > share * limit:
+                text = f"must lie in [-{share * limit:g}, {share * limit:g}] (trajectory.limit_share of the limit)"
+                yield Problem(("task", key, i), text, value)
     if task.start == task.goal:
         yield Problem(("task", "goal"), "must differ from task.start", task.goal)
 
@@ -119,15 +126,17 @@ def _design_names(plant: PlantConfig, design: dict[str, Variable]) -> Iterator[P
 
 def _positive_design(design: dict[str, Variable]) -> Iterator[Problem]:
     for name, variable in design.items():
-        if variable.min <= 0:
-            yield Problem(("design", name, "min"), "must be > 0: masses and lengths are positive", variable.min)
+        if variable.min < SMALLEST_DESIGN:
+            text = f"must be >= {SMALLEST_DESIGN:g}: masses and lengths are positive"
+            yield Problem(("design", name, "min"), text, variable.min)
 
 
 def _positive_weights(weights: WeightsConfig) -> Iterator[Problem]:
     for letter, variables in weights:
         for i, variable in enumerate(variables):
-            if variable.min <= 0:
-                yield Problem(("weights", letter, i, "min"), "must be > 0: weights have a log scale", variable.min)
+            if variable.min < SMALLEST_WEIGHT:
+                text = f"must be >= {SMALLEST_WEIGHT:g}: weights have a log scale"
+                yield Problem(("weights", letter, i, "min"), text, variable.min)
 
 
 def _something_free(

@@ -84,7 +84,7 @@ def test_help_of_optimize_names_every_key_with_unit_and_default(arguments):
             continue
         assert "(default: " in options[key], key
         assert re.search(r"\[.+\]", options[key]) or "{" in options[key], key
-    assert "[kg] (default: 0.7)" in options["design.mass.initial"]
+    assert "[kg] (>= -1e+09 and <= 1e+09) (default: 0.7)" in options["design.mass.initial"]
     assert "[1/(s (N m)^2)] (default: 0.001)" in options["weights.r.0.min"]
     assert "hold the initial value" in text
 
@@ -105,7 +105,7 @@ WRONG = {
     "wrong type": (["optimize", RTCD, "--search.population", "x"], "Error parsing --search.population"),
     "wrong name": (["optimize", RTCD, "--search.objective", "inlets"], "invalid choice 'inlets'"),
     "out of range": (["optimize", RTCD, "--search.population", "3"], "search.population = 3: must be >= 4"),
-    "start outside": (["optimize", RTCD, "--task.start", "7", "0"], "task.start.0 = 7.0: must lie in"),
+    "start outside": (["optimize", RTCD, "--task.start", "7", "0"], "task.start.0 = 7.0: must lie between"),
     "too few": (["optimize", RTCD, "--task.start", "1"], "task.start: must have 2 entries (theta, theta_dot), has 1"),
     "no run": (["verify", "no/such/run"], "no/such/run: no such run folder"),
     "no states": (["verify", "configs", "--states", "0"], "--states = 0: must be >= 1"),
