@@ -199,7 +199,9 @@ def replay(arguments: Sequence[str]) -> int:
     from rtcd_jax.system.console import Console
 
     with Console() as console:
-        kept = replay_run(options.run, options.file, options.elite, console)
+        kept = replay_run(
+            options.run, options.file, options.elite, console, options.columns, options.start, options.unwrap
+        )
     return OK if kept else BROKEN_PROMISE
 
 

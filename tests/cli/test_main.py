@@ -268,7 +268,7 @@ def test_a_failing_report_ends_nothing(run_module, tmp_path, monkeypatch, capsys
 def test_replay_exits_by_the_funnel(monkeypatch, tmp_path, kept, code):
     calls = []
     module = types.ModuleType("rtcd_jax.analysis.replay.replay")
-    module.replay_run = lambda folder, file, elite, console: calls.append((folder, file, elite)) or kept
+    module.replay_run = lambda folder, file, elite, *_: calls.append((folder, file, elite)) or kept
     monkeypatch.setitem(sys.modules, "rtcd_jax.analysis.replay.replay", module)
     for elite in ("2", "initial"):
         assert cli.main(["replay", str(tmp_path), "lab.csv", "--elite", elite]) == code
