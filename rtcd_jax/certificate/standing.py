@@ -20,7 +20,7 @@ from typing import Any, Literal, final
 import numpy as np
 
 from rtcd_jax.certificate import check
-from rtcd_jax.certificate.check import Damaged, Node, Refused, Report
+from rtcd_jax.certificate.check import Damaged, Node, Refused, Report, Undecided
 from rtcd_jax.certificate.prove.closed_loop import claim_of
 from rtcd_jax.elite.elite import Elite
 from rtcd_jax.system.errors import UserError
@@ -29,7 +29,7 @@ from rtcd_jax.system.files import replace_json
 RATE_ROUNDING = 1e-12
 """Share of the largest rate by which another machine's sine may change one."""
 
-Verdict = Literal["proved", "missing", "damaged", "of another elite", "refused"]
+Verdict = Literal["proved", "missing", "damaged", "of another elite", "refused", "undecided"]
 
 
 @final
@@ -79,12 +79,14 @@ def standing_of(
 ) -> Standing:
     """What the certificate at `path` is worth for an elite."""
     try:
-        file = path.read_bytes()
-        content = check.parse(file.decode("ascii"))
+        file = check.read_bytes(path)
+        content = check.parse(file)
         check.read_claim(Node("certificate.claim", content["claim"]))
     except OSError as error:
         return Standing("missing", f"{path}: {error.strerror}")
-    except (Refused, UnicodeDecodeError, KeyError, TypeError) as error:
+    except Undecided as undecided:
+        return Standing("undecided", f"{path}: {undecided}")
+    except (Refused, KeyError, TypeError) as error:
         return Standing("damaged", f"{path} is no certificate: {error}")
     try:
         other = difference(content["claim"], claim_of(elite))
@@ -93,7 +95,7 @@ def standing_of(
     if other:
         return Standing("of another elite", f"{path} is of another elite: {other}")
     digest = hashlib.sha256(file).hexdigest()
-    return _remembered(digest) or remember(digest, _checked(content, digest, progress))
+    return _remembered(digest) or _checked(content, digest, progress)
 
 
 def difference(claimed: Mapping[str, Any], stored: Mapping[str, Any]) -> str:
@@ -130,11 +132,14 @@ def _told(place: str, value: Any) -> str:
 def _checked(content: Any, digest: str, progress: Callable[[int, int], None]) -> Standing:
     """The checker's verdict on a file of this digest."""
     try:
-        return accepted(check.check(content, progress), digest)
+        with check.within(check.SECONDS):
+            return remember(digest, accepted(check.check(content, progress), digest))
+    except Undecided as undecided:
+        return Standing("undecided", str(undecided))
     except Damaged as damaged:
-        return Standing("damaged", str(damaged))
+        return remember(digest, Standing("damaged", str(damaged)))
     except Refused as refused:
-        return Standing("refused", str(refused))
+        return remember(digest, Standing("refused", str(refused)))
 
 
 def accepted(report: Report, digest: str) -> Standing:

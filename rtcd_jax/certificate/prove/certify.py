@@ -114,7 +114,7 @@ def _finish(path: Path, content: dict[str, Any], elite: Elite, rung: str, second
     file = (json.dumps(content, separators=(",", ":")) + "\n").encode()
     if rung == "proved":
         digest = hashlib.sha256(file).hexdigest()
-        remember(digest, accepted(check.check(check.parse(file.decode())), digest))
+        remember(digest, accepted(check.check(check.parse(file)), digest))
     replace(path, file)
     journal.close()
     claim = check.read_claim(Node("claim", content["claim"]))
