@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -9,6 +10,15 @@ import numpy as np
 from rtcd_jax.config.load import Config
 from rtcd_jax.plants import plant_class
 from rtcd_jax.plants.base import Plant
+from rtcd_jax.system.errors import ConfigError
+from rtcd_jax.system.errors import Problem as Fault
+
+AT_REST = 1e-6
+"""Largest rate of a goal [state/s]: one typed with 16 digits leaves the rounding of pi times the stiffness."""
+NEAR = 0.15
+"""From a quarter turn [rad]: what was meant by 3, 3.1 or 3.14."""
+DESIGNS, STATES, LARGEST_STATE = 3, 8, 10.0
+"""Where the MJCF is compared with the equations: random designs, states of each, within this or the task's limits."""
 
 
 @dataclass(frozen=True)
@@ -61,7 +71,8 @@ def make_problem(config: Config) -> Problem:
     """The problem that a configuration describes.
 
     Raises:
-        ValueError: if the goal is no equilibrium of the initial design without input.
+        ConfigError: if the goal is no equilibrium of the initial design without input.
+        UserError: if the robot's MJCF does not move as its equations say, at random states, inputs and designs.
     """
     constants = config.plant.model_dump(exclude={"name"})
     plant = plant_class(config.plant.name)(**constants)
@@ -74,7 +85,8 @@ def make_problem(config: Config) -> Problem:
         input_limits=np.array(plant.input_limit, float),
         variables=tuple(_variables(config)),
     )
-    _check_equilibrium(problem)
+    _require_equilibrium(problem)
+    _require_agreement(problem)
     return problem
 
 
@@ -90,14 +102,60 @@ def _variables(config: Config):
         )
 
 
-def _check_equilibrium(problem: Problem) -> None:
-    plant = problem.plant
-    values = [jnp.asarray(variable.initial) for variable in problem.variables if variable.design]
-    design = plant.Design(*values)
-    rate = np.asarray(jax.jit(plant.dynamics)(design, jnp.asarray(problem.goal), jnp.zeros(plant.m)))
-    # A goal typed with 16 digits leaves the rounding of pi times the stiffness of the robot.
-    if np.max(np.abs(rate)) > 1e-6:
-        raise ValueError(
-            f"task.goal = {problem.goal.tolist()} is no equilibrium without input: there the state's derivative is "
-            f"{rate.tolist()} and would have to be zero"
+def _require_equilibrium(problem: Problem) -> None:
+    plant, initial = problem.plant, _design(problem, 0.0)
+    dynamics = jax.jit(plant.dynamics)
+
+    def rates(state: np.ndarray) -> np.ndarray:
+        return np.asarray(dynamics(initial, jnp.asarray(state), jnp.zeros(plant.m)))
+
+    found = rates(problem.goal)
+    if np.max(np.abs(found)) <= AT_REST:
+        return
+    quarters = np.round(problem.goal / (np.pi / 2))
+    turns = quarters * np.pi / 2
+    near = [
+        unit == "rad" and abs(turn - value) < NEAR
+        for unit, turn, value in zip(plant.state_units, turns, problem.goal, strict=True)
+    ]
+    meant, hint = np.where(near, turns, problem.goal), ""
+    if np.max(np.abs(rates(meant))) <= AT_REST:
+        named = (
+            f"{plant.state_names[i]} = {_quarter_turns(int(quarters[i]))}"
+            for i in np.flatnonzero(meant != problem.goal)
         )
+        hint = f"; did you mean {', '.join(named)}?"
+    text = (
+        f"is no equilibrium without input: there the state's derivative is {found.tolist()} and would have to be zero"
+    )
+    raise ConfigError([Fault(("task", "goal"), text + hint, problem.goal.tolist())])
+
+
+def _quarter_turns(count: int) -> str:
+    """`pi (3.141592653589793)`, `-pi/2 (…)`, `0`."""
+    if count == 0:
+        return "0"
+    whole, half = divmod(abs(count), 2)
+    sign, times = "-" * (count < 0), abs(count) if half else whole
+    return f"{sign}{f'{times} ' if times > 1 else ''}pi{'/2' if half else ''} ({count * np.pi / 2!r})"
+
+
+def _require_agreement(problem: Problem) -> None:
+    from rtcd_jax.plants.agreement import require_agreement
+
+    rng = np.random.default_rng(0)
+    designs = [_design(problem, share) for share in (0.0, *rng.random(DESIGNS))]
+    largest = np.minimum(problem.state_limits, LARGEST_STATE)
+    x = rng.uniform(-largest, largest, (STATES, problem.plant.n))
+    u = rng.uniform(-problem.input_limits, problem.input_limits, (STATES, problem.plant.m))
+    require_agreement(problem.plant, designs, x, u)
+
+
+def _design(problem: Problem, share: float) -> eqx.Module:
+    """At a share of the way from the initial design to the far corner of its box."""
+    fields = (variable for variable in problem.variables if variable.design)
+    return problem.plant.Design(*(jnp.asarray(v.initial + share * (_far_end(v) - v.initial)) for v in fields))
+
+
+def _far_end(variable: Variable) -> float:
+    return max(variable.low, variable.high, key=lambda end: abs(end - variable.initial))

@@ -16,9 +16,8 @@ LAYERS = (
     {"plants"},
     {"types", "problem", "genome", "trajectory", "policy", "rollout", "validation", "funnel", "volume", "evaluation"},
     {"search", "elite"},
-    {"analysis", "certificate", "export"},
     {"run"},
-    {"analysis.scale"},  # whole runs are what it measures
+    {"analysis", "certificate", "export"},
     {"cli"},
     {"__main__"},
 )

@@ -6,6 +6,7 @@ import pytest
 from rtcd_jax.config.load import EXAMPLE, parse_yaml
 from rtcd_jax.plants.pendulum import Pendulum
 from rtcd_jax.problem import make_problem
+from rtcd_jax.system.errors import ConfigError
 
 
 def problem_of(text=EXAMPLE):
@@ -51,5 +52,24 @@ def test_a_goal_within_rounding_of_an_equilibrium_is_taken(goal):
 @pytest.mark.parametrize("goal", ["[3.1415, 0]", "[3.141592, 0]", "[3.141592653589793, 0.001]", "[1, 0]"])
 def test_a_goal_that_is_no_equilibrium_is_refused(goal):
     """An angle short by d leaves an acceleration of g d / l, 24.5 d here: 1.6e-5 for six decimals, 2e-7 for eight."""
-    with pytest.raises(ValueError, match=r"task\.goal = .* is no equilibrium without input: .* would have to be zero"):
+    with pytest.raises(ConfigError, match=r"task\.goal = .* is no equilibrium without input: .* would have to be zero"):
         problem_of(EXAMPLE.replace("goal: [3.141592653589793, 0]", f"goal: {goal}"))
+
+
+@pytest.mark.parametrize(
+    ("goal", "meant"),
+    [
+        ("[3.14, 0]", "; did you mean theta = pi (3.141592653589793)?"),
+        ("[-3, 0]", "; did you mean theta = -pi (-3.141592653589793)?"),
+        ("[6.2, 0]", "; did you mean theta = 2 pi (6.283185307179586)?"),
+        ("[0.01, 0]", "; did you mean theta = 0?"),
+        ("[1.57, 0]", "zero"),
+        ("[3.14, 0.1]", "zero"),
+    ],
+)
+def test_the_equilibrium_beside_a_goal_is_named(goal, meant):
+    """A quarter turn is none of the pendulum's, and no angle mends a speed."""
+    text = EXAMPLE.replace("goal: [3.141592653589793, 0]", f"goal: {goal}").replace("start: [0, 0]", "start: [1, 0]")
+    with pytest.raises(ConfigError) as caught:
+        problem_of(text)
+    assert str(caught.value).endswith(meant)

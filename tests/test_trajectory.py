@@ -211,3 +211,15 @@ def test_shapes_are_those_of_the_nouns(planned, problem):
     assert planned.xs.shape == (POPULATION, problem.intervals + 1, 2)
     for leaf in (planned.dt, planned.cost, planned.defect, planned.iterations, planned.status):
         assert leaf.shape == (POPULATION,)
+
+
+@pytest.mark.slow
+def test_a_given_duration_is_kept_to_the_last_bit(problem, draw):
+    """The cost can only rise above that of the free step, whose box holds the fixed one."""
+    candidates, step = draw(8), type(problem.config.trajectory.step)(min=0.07, max=0.07)
+    free = jax.jit(partial(plan, problem))(candidates)
+    held = jax.jit(partial(plan, with_trajectory(problem, step=step)))(candidates)
+    assert (held.status == Status.OK).all()
+    np.testing.assert_array_equal(held.dt, 0.07)
+    assert np.max(held.defect) <= 1e-9
+    assert np.all(held.cost >= free.cost * (1 - 1e-3))

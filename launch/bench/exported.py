@@ -1,10 +1,11 @@
 """Time of one step of an exported controller: `rtcd export RUN --to DIR`, then this script on DIR.
 
-Python by its median over many single calls, C by the loop in `controller_test.c`, both on the motion itself.
+Python by its median over many single calls, C by the loop in its test, both on the motion itself.
 """
 
 import argparse
 import importlib.util
+import json
 import re
 import shutil
 import statistics
@@ -19,11 +20,16 @@ from measure import RESULTS, environment, save
 CALLS = 20_000
 
 
+def _name(folder: Path) -> str:
+    """Of the controller's files."""
+    return json.loads((folder / "export.json").read_text())["name"]
+
+
 def load_controller(folder: Path) -> ModuleType:
     """The exported module, from its file."""
-    spec = importlib.util.spec_from_file_location("controller", folder / "controller.py")
+    spec = importlib.util.spec_from_file_location("controller", folder / f"{_name(folder)}_controller.py")
     if spec is None or spec.loader is None:
-        raise SystemExit(f"{folder} is no export: it has no controller.py")
+        raise SystemExit(f"{folder} is no export: it has no controller")
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     return module
@@ -59,7 +65,7 @@ def c_step(folder: Path) -> float | None:
         return None
     with tempfile.TemporaryDirectory() as place:
         program = Path(place) / "controller_test"
-        sources = [folder / "controller_test.c", folder / "controller.c"]
+        sources = [folder / f"{_name(folder)}_controller{end}.c" for end in ("_test", "")]
         subprocess.run([compiler, "-std=c99", "-O2", *sources, "-lm", "-o", program], check=True)
         done = subprocess.run([program, folder / "test_vectors.csv"], check=True, capture_output=True, text=True)
     found = re.search(r"(\d+) ns", done.stdout)

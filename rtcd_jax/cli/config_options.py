@@ -9,9 +9,7 @@ from tyro.constructors import StructConstructorSpec, StructFieldSpec, StructType
 
 from rtcd_jax.config.load import Config
 from rtcd_jax.config.schema import UNIT, Variable
-from rtcd_jax.config.settings import Settings, bounds
-
-POLICY_UNITS = {"authority": "-", "discount": "1/s"}
+from rtcd_jax.config.settings import Settings, bounds, unit
 
 
 @dataclass(frozen=True)
@@ -33,10 +31,9 @@ def config_branch(config: Config) -> Branch:
     design = {name: _section(variable, plant.design[name]) for name, variable in config.design.items()}
     weights = {"q": _list(config.weights.q, plant.states), "r": _list(config.weights.r, plant.inputs)}
     task = _section(config.task, ", ".join(plant.states.values()))
-    searched = config.policy.variables()
-    policy = _section(
-        config.policy, branches={name: _section(option, POLICY_UNITS[name]) for name, option in searched.items()}
-    )
+    options = type(config.policy).model_fields
+    searched = {name: _section(option, unit(options[name])) for name, option in config.policy.variables().items()}
+    policy = _section(config.policy, branches=searched)
     branches = {"task": task, "design": _group(design), "weights": _group(weights), "policy": policy}
     return _section(config, branches=branches)
 

@@ -1,6 +1,5 @@
 """The page of all configuration keys, made from their models: `python -m rtcd_jax.cli.config_page docs/config.md`."""
 
-import re
 import sys
 from collections.abc import Iterable, Iterator
 from pathlib import Path
@@ -11,7 +10,7 @@ from pydantic.fields import FieldInfo
 
 from rtcd_jax.config.load import Config
 from rtcd_jax.config.schema import PLANTS, UNIT, PlantConfig, Variable
-from rtcd_jax.config.settings import Settings, bounds
+from rtcd_jax.config.settings import Settings, bounds, unit, without_unit
 from rtcd_jax.system.files import replace
 
 HEAD = """\
@@ -23,8 +22,6 @@ option of `rtcd optimize CONFIG`, as `--search.population 256`; with `--help` it
 All numbers are in SI units, angles in rad; `-` is a number without unit. "the paper" is Girlanda et al., ICRA 2024.
 """
 _HEADING = "| key | unit | default | range | meaning |\n|---|---|---|---|---|"
-_UNIT = re.compile(r"\s*\[([^\[\]]+)\]")
-_LIMITS = re.compile(r"\s*\((>[^()]*)\)$")
 
 
 def reference() -> str:
@@ -51,7 +48,7 @@ def _section(name: str, field: FieldInfo) -> Iterator[str]:
     elif get_origin(kind) is dict:
         for plant, model in PLANTS.items():
             yield f"### {plant}\n"
-            yield _table([(f"{name}.{key}", unit, "required", "", "a variable") for key, unit in model.design.items()])
+            yield _table([(f"{name}.{key}", told, "required", "", "a variable") for key, told in model.design.items()])
     else:
         yield _table(_rows(f"{name}.", _model(kind)))
 
@@ -63,16 +60,11 @@ def _rows(prefix: str, model: type[Settings]) -> Iterator[tuple[str, str, str, s
         if isinstance(kind, type) and issubclass(kind, Settings):
             yield from _rows(f"{prefix}{name}.", kind)
             continue
-        text = str(field.description)
-        found = _UNIT.search(text)
-        unit = found.group(1) if found else ""
-        told = _LIMITS.search(text)
-        meaning = _LIMITS.sub("", _UNIT.sub("", text, count=1))
+        meaning = without_unit(field)
         if Variable in _leaves(kind):
             listed = get_origin(kind) is tuple
             meaning += "; a list of variables" if listed else "; or a variable, then it is searched"
-        limits = told.group(1) if told else _range(field)
-        yield f"{prefix}{name}", unit.replace(UNIT, "its own"), _default(field), limits, meaning
+        yield f"{prefix}{name}", unit(field).replace(UNIT, "its own"), _default(field), _range(field), meaning
 
 
 def _default(field: FieldInfo) -> str:

@@ -9,6 +9,7 @@ import os
 import sys
 from collections.abc import Callable, Sequence
 from concurrent.futures import BrokenExecutor
+from functools import partial
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -28,7 +29,8 @@ def optimize(arguments: Sequence[str]) -> int:
     def run(console, cluster) -> None:
         from rtcd_jax.run.optimize import optimize as run_optimize
 
-        run_optimize(config, options.run, console, cluster)
+        worked = run_optimize(config, options.run, console, cluster)
+        cluster.on_first(lambda: _finish_page(options.run, worked, console))
 
     return _on_cluster(options.machines, options.run, run)
 
@@ -50,7 +52,8 @@ def sweep(arguments: Sequence[str]) -> int:
         for case in cases if options.case is None else [cases[options.case]]:
             console.message(f"case {case.number} of 0 … {len(cases) - 1}: {case.folder}")
             try:
-                run_optimize(case.config, case.folder, console, cluster)
+                worked = run_optimize(case.config, case.folder, console, cluster)
+                cluster.on_first(partial(_finish_page, case.folder, worked, console))
             except UserError as error:  # the others may do better
                 console.message(f"case {case.number} ended early: {error}")
                 failed.append(case.folder.name)
@@ -135,9 +138,11 @@ def report(arguments: Sequence[str]) -> int:
 
     options = read_report(arguments)
     from rtcd_jax.analysis.report import report as write_report
+    from rtcd_jax.system.console import Console
 
-    page, *figures = write_report(options.runs, options.to)
-    print(f"{page}, and {len(figures)} figures in {figures[0].parent}")
+    with Console() as console:
+        page, *figures = write_report(options.runs, options.to, console)
+        console.message(f"{page}, and {len(figures)} figures in {figures[0].parent}")
     return OK
 
 
@@ -146,12 +151,29 @@ def _refresh(run: Path, console: Any) -> None:
     from rtcd_jax.analysis.report import refresh
 
     try:
-        page = refresh(run)
+        page = refresh(run, console)
     except UserError as error:
         console.message(f"{run / 'report.html'} does not show this yet: {error}")
     else:
         if page:
             console.message(f"{page} shows this, too")
+
+
+def _finish_page(run: Path, changed: bool, console: Any) -> None:
+    """Makes a finished run's page and figures, unless they are there and still true.
+
+    The run is whole without them: what goes wrong here is told, and ends nothing.
+    """
+    if not changed and (run / "report.html").is_file():
+        return
+    from rtcd_jax.analysis.report import report
+
+    try:
+        page, *figures = report([run])
+    except Exception as error:
+        console.message(f"the run is finished, but its report failed: {error!r}; `rtcd report {run}` makes it")
+    else:
+        console.message(f"{page}, and {len(figures)} figures in {figures[0].parent}")
 
 
 def animate(arguments: Sequence[str]) -> int:
@@ -177,7 +199,9 @@ def replay(arguments: Sequence[str]) -> int:
     from rtcd_jax.system.console import Console
 
     with Console() as console:
-        kept = replay_run(options.run, options.file, options.elite, console)
+        kept = replay_run(
+            options.run, options.file, options.elite, console, options.columns, options.start, options.unwrap
+        )
     return OK if kept else BROKEN_PROMISE
 
 
@@ -206,7 +230,7 @@ def export(arguments: Sequence[str]) -> int:
     from rtcd_jax.system.console import Console
 
     with Console() as console:
-        export_run(options.run, options.elite, options.to, console)
+        export_run(options.run, options.elite, options.to, console, options.name)
     return OK
 
 

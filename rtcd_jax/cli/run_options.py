@@ -1,5 +1,6 @@
 """Options of the commands that read a finished run: verify, report, animate, replay, disturb, export."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -58,10 +59,12 @@ class AnimateOptions:
 class ReplayOptions:
     """Was a measured run inside the funnel? V/rho of every sample; exit code 1 if it left.
 
-    FILE has the columns time,pos,vel,torque or time,pos1,pos2,vel1,vel2,tau1,tau2 in SI units, the time from the start
-    of the swing-up. Errors of angles are not wrapped: unwrap the encoder first.
+    FILE is a table of times and states in SI units under a line of column names, which are found by their words
+    (position, vel2, cart_pos, pos_meas1, "Angle [deg]" …). Time counts from the start of the swing-up. Errors of angles
+    are not wrapped.
 
-    Example: rtcd replay checkpoints/pendulum_rtcd measured.csv --elite 0
+    Example: rtcd replay checkpoints/pendulum_rtcd measured.csv --start 2.5 --unwrap
+    Example: rtcd replay checkpoints/pendulum_rtcd log.csv --columns time=stamp theta=enc theta_dot=4
     """
 
     run: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RUN", help="the run folder")]
@@ -69,6 +72,14 @@ class ReplayOptions:
     elite: Annotated[
         int | Literal["initial"], tyro.conf.arg(metavar="K", help="whose funnel; 0 is the best [-] (>= 0); or initial")
     ] = 0
+    columns: Annotated[
+        tuple[str, ...],
+        tyro.conf.arg(metavar="NAME=COLUMN …", help="columns of the time and the states, by name or number from 1"),
+    ] = ()
+    start: Annotated[
+        float | None, tyro.conf.arg(metavar="T", help="time of the file at which the motion begins [s]; else 0")
+    ] = None
+    unwrap: Annotated[bool, tyro.conf.arg(help="take whole turns out of angles that wrap")] = False
 
 
 @dataclass(frozen=True)
@@ -95,6 +106,10 @@ class ExportOptions:
     elite: Annotated[
         int | Literal["initial"], tyro.conf.arg(metavar="K", help="0 is the best [-] (>= 0); or initial")
     ] = 0
+    name: Annotated[
+        str | None,
+        tyro.conf.arg(metavar="NAME", help="of the controller's files and C symbols; by default ROBOT_ELITE"),
+    ] = None
 
 
 def read_verify(arguments: Sequence[str]) -> VerifyOptions:
@@ -127,6 +142,8 @@ def read_replay(arguments: Sequence[str]) -> ReplayOptions:
     """The checked options of `rtcd replay`; `UserError` if one is out of range."""
     options = tyro.cli(ReplayOptions, args=arguments, prog="rtcd replay", use_underscores=True)
     require_elite(options.elite)
+    if options.start is not None and not math.isfinite(options.start):
+        raise UserError(f"--start = {options.start}: must be a finite number of seconds")
     require_run(options.run, OPTIMIZE_USAGE)
     return options
 

@@ -6,7 +6,6 @@
 import hashlib
 import inspect
 import json
-import re
 from collections.abc import Callable, Collection, Iterator, Mapping
 from pathlib import Path
 from typing import Annotated, Any
@@ -22,6 +21,7 @@ from pydantic import (
     field_validator,
 )
 
+from rtcd_jax.config import yaml12
 from rtcd_jax.config.schema import (
     CheckpointConfig,
     ElitesConfig,
@@ -36,7 +36,7 @@ from rtcd_jax.config.schema import (
     read_plant,
 )
 from rtcd_jax.config.settings import Settings, problems_of
-from rtcd_jax.system.errors import ConfigError, Problem, closest
+from rtcd_jax.system.errors import ConfigError, Problem, closest, printable
 
 EXAMPLE = """\
 plant: {name: pendulum}
@@ -48,14 +48,16 @@ weights:
 """
 """The shortest complete YAML: the paper's pendulum with the default settings."""
 
+SMALLEST_DESIGN, SMALLEST_WEIGHT = 1e-6, 1e-9
+
 
 class Config(Settings):
     """Everything that defines a run."""
 
     plant: Annotated[SerializeAsAny[PlantConfig], PlainValidator(read_plant)] = Field(description="the robot")
     task: TaskConfig = Field(description="from where to where, and within what")
-    design: dict[str, Variable] = Field(description="the plant's design fields by name")
-    weights: WeightsConfig = Field(description="cost weights, searched on a log scale")
+    design: dict[str, Variable] = Field(description="the plant's design fields by name, all >= 1e-6")
+    weights: WeightsConfig = Field(description="cost weights >= 1e-9, searched on a log scale")
     trajectory: TrajectoryConfig = Field(default=TrajectoryConfig(), description="the nominal motion")
     policy: PolicyConfig = Field(default=PolicyConfig(), description="the controller that tracks it")
     funnel: FunnelConfig = Field(default=FunnelConfig(), description="how the funnel is sampled")
@@ -97,11 +99,16 @@ def _size(path: tuple[str, ...], values: tuple, names: Collection[str]) -> Itera
         yield Problem(path, f"must have {len(names)} {plural} ({', '.join(names)}), has {len(values)}")
 
 
-def _ends(task: TaskConfig) -> Iterator[Problem]:
+def _ends(task: TaskConfig, trajectory: TrajectoryConfig) -> Iterator[Problem]:
+    share = trajectory.limit_share
     for key in ("start", "goal"):
         for i, (value, limit) in enumerate(zip(getattr(task, key), task.state_limits, strict=False)):
-            if abs(value) > limit:
-                yield Problem(("task", key, i), f"must lie in [-{limit:g}, {limit:g}] (task.state_limits)", value)
+            if abs(value) >= limit:
+                text = f"must lie between -{limit:g} and {limit:g} (task.state_limits): on a limit there is no funnel"
+                yield Problem(("task", key, i), text, value)
+            elif abs(value) > share * limit:
+                text = f"must lie in [-{share * limit:g}, {share * limit:g}] (trajectory.limit_share of the limit)"
+                yield Problem(("task", key, i), text, value)
     if task.start == task.goal:
         yield Problem(("task", "goal"), "must differ from task.start", task.goal)
 
@@ -119,15 +126,17 @@ def _design_names(plant: PlantConfig, design: dict[str, Variable]) -> Iterator[P
 
 def _positive_design(design: dict[str, Variable]) -> Iterator[Problem]:
     for name, variable in design.items():
-        if variable.min <= 0:
-            yield Problem(("design", name, "min"), "must be > 0: masses and lengths are positive", variable.min)
+        if variable.min < SMALLEST_DESIGN:
+            text = f"must be >= {SMALLEST_DESIGN:g}: masses and lengths are positive"
+            yield Problem(("design", name, "min"), text, variable.min)
 
 
 def _positive_weights(weights: WeightsConfig) -> Iterator[Problem]:
     for letter, variables in weights:
         for i, variable in enumerate(variables):
-            if variable.min <= 0:
-                yield Problem(("weights", letter, i, "min"), "must be > 0: weights have a log scale", variable.min)
+            if variable.min < SMALLEST_WEIGHT:
+                text = f"must be >= {SMALLEST_WEIGHT:g}: weights have a log scale"
+                yield Problem(("weights", letter, i, "min"), text, variable.min)
 
 
 def _something_free(
@@ -183,22 +192,6 @@ def parse(data: Any, source: str = "configuration") -> Config:
     raise ConfigError(problems, source)
 
 
-class _Loader(yaml.SafeLoader):
-    """PyYAML's safe loader, but 1e-3 is a number, as in YAML 1.2, and a key given twice is an error."""
-
-    def construct_mapping(self, node, deep=False):
-        seen = set()
-        for key, _ in node.value:
-            if isinstance(key, yaml.ScalarNode) and key.value in seen:
-                raise yaml.MarkedYAMLError(problem=f"the key {key.value!r} is given twice", problem_mark=key.start_mark)
-            seen.add(str(key.value))
-        return super().construct_mapping(node, deep)
-
-
-_EXPONENT_WITHOUT_DOT = re.compile(r"[-+]?\d+[eE][-+]?\d+$")
-_Loader.add_implicit_resolver("tag:yaml.org,2002:float", _EXPONENT_WITHOUT_DOT, list("-+0123456789"))
-
-
 def parse_yaml(text: str | bytes, source: str = "configuration") -> Config:
     """The configuration that a YAML text describes; `ConfigError` if it is no YAML or no valid configuration."""
     return parse(_plain_yaml(text, source), source)
@@ -206,13 +199,9 @@ def parse_yaml(text: str | bytes, source: str = "configuration") -> Config:
 
 def _plain_yaml(text: str | bytes, source: str) -> Any:
     try:
-        return yaml.load(text, _Loader)
-    except yaml.MarkedYAMLError as error:
-        mark = error.problem_mark
-        place = f"line {mark.line + 1}, column {mark.column + 1}: " if mark else ""
-        raise ConfigError([Problem((), f"no valid YAML: {place}{error.problem}")], source) from None
-    except yaml.YAMLError as error:
-        raise ConfigError([Problem((), f"no valid YAML: {error}")], source) from None
+        return yaml12.read(text)
+    except yaml12.NotYaml as error:
+        raise ConfigError([Problem((), printable(error))], source) from None
 
 
 def load(path: Path) -> Config:
@@ -231,7 +220,8 @@ def read_yaml(path: Path) -> Any:
         there = sorted(str(other) for other in folder.glob("*.y*ml"))
         advice = closest(path, there) if there else f"{folder} has no YAML file"
         raise ConfigError([Problem((), f"{what}; {advice}")], str(path))
-    return _plain_yaml(path.read_bytes(), str(path))
+    with path.open("rb") as file:
+        return _plain_yaml(file.read(yaml12.LARGEST_FILE + 1), str(path))
 
 
 def resolved(config: Config) -> dict[str, Any]:

@@ -3,10 +3,13 @@
 "the paper" is Girlanda et al., ICRA 2024 (arXiv 2403.10966).
 """
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from math import inf
 from typing import Annotated, Any, ClassVar, Literal
 
-from pydantic import Field, PlainValidator, SerializeAsAny
+from pydantic import Field, GetCoreSchemaHandler, SerializeAsAny
+from pydantic_core.core_schema import CoreSchema, no_info_plain_validator_function
 
 from rtcd_jax.config.settings import Settings, invalid
 from rtcd_jax.system.errors import Problem, closest
@@ -31,9 +34,9 @@ class PendulumConfig(PlantConfig):
     design: ClassVar = {"mass": "kg", "length": "m"}
 
     name: Literal["pendulum"] = Field(default="pendulum", description="torque-limited pendulum (paper, section III)")
-    damping: float = Field(default=0.1, ge=0, description="viscous friction at the pivot [N m s/rad]")
-    gravity: float = Field(default=9.81, gt=0, description="gravitational acceleration [m/s^2]")
-    torque_limit: float = Field(default=2.5, gt=0, description="largest |torque| of the motor [N m]")
+    damping: float = Field(default=0.1, ge=0, le=1e6, description="viscous friction at the pivot [N m s/rad]")
+    gravity: float = Field(default=9.81, ge=1e-6, le=1e6, description="gravitational acceleration [m/s^2]")
+    torque_limit: float = Field(default=2.5, ge=1e-6, le=1e6, description="largest |torque| of the motor [N m]")
 
 
 class CartpoleConfig(PlantConfig):
@@ -42,11 +45,13 @@ class CartpoleConfig(PlantConfig):
     design: ClassVar = {"pole_length": "m", "pole_mass": "kg"}
 
     name: Literal["cartpole"] = Field(default="cartpole", description="force-limited cart-pole (paper, section III)")
-    cart_mass: float = Field(default=1.0731266, gt=0, description="mass of the cart, its motor's inertia included [kg]")
-    cart_damping: float = Field(default=5.4, ge=0, description="viscous friction of the cart [N s/m]")
-    pivot_damping: float = Field(default=0.0024, ge=0, description="viscous friction at the pivot [N m s/rad]")
-    gravity: float = Field(default=9.81, gt=0, description="gravitational acceleration [m/s^2]")
-    force_limit: float = Field(default=6.0, gt=0, description="largest |force| on the cart [N]")
+    cart_mass: float = Field(
+        default=1.0731266, ge=1e-6, le=1e6, description="mass of the cart, its motor's inertia included [kg]"
+    )
+    cart_damping: float = Field(default=5.4, ge=0, le=1e6, description="viscous friction of the cart [N s/m]")
+    pivot_damping: float = Field(default=0.0024, ge=0, le=1e6, description="viscous friction at the pivot [N m s/rad]")
+    gravity: float = Field(default=9.81, ge=1e-6, le=1e6, description="gravitational acceleration [m/s^2]")
+    force_limit: float = Field(default=6.0, ge=1e-6, le=1e6, description="largest |force| on the cart [N]")
     inertia: Literal["rod", "measured"] = Field(
         default="rod", description="of the pole about its center of mass: a uniform rod's, or the measured constant"
     )
@@ -70,9 +75,9 @@ def read_plant(data: Any) -> PlantConfig:
 class Variable(Settings):
     """One searched number and its box."""
 
-    initial: float = Field(description=f"value of the initial candidate [{UNIT}]")
-    min: float = Field(description=f"lower end of the box [{UNIT}]")
-    max: float = Field(description=f"upper end of the box [{UNIT}]")
+    initial: float = Field(ge=-1e9, le=1e9, description=f"value of the initial candidate [{UNIT}]")
+    min: float = Field(ge=-1e9, le=1e9, description=f"lower end of the box [{UNIT}]")
+    max: float = Field(ge=-1e9, le=1e9, description=f"upper end of the box [{UNIT}]")
     pinned: bool = Field(default=False, description="hold the initial value instead of searching")
 
     @property
@@ -88,15 +93,23 @@ class Variable(Settings):
 
 
 # Strictness is for the numbers: YAML's lists become tuples.
-Numbers = Annotated[tuple[float, ...], Field(strict=False)]
-Limits = Annotated[tuple[Annotated[float, Field(gt=0, allow_inf_nan=True)], ...], Field(strict=False)]
+Numbers = Annotated[tuple[Annotated[float, Field(ge=-1e6, le=1e6)], ...], Field(strict=False)]
+Limits = Annotated[tuple[Annotated[float, Field(ge=1e-6, allow_inf_nan=True)], ...], Field(strict=False)]
+LARGEST_LIMIT = 1e6
 Variables = Annotated[tuple[Variable, ...], Field(strict=False)]
 
 
 class TaskConfig(Settings):
     start: Numbers = Field(description=f"first state of the nominal motion, pinned [{UNIT}]")
     goal: Numbers = Field(description=f"last state of the nominal motion, pinned, an equilibrium [{UNIT}]")
-    state_limits: Limits = Field(description=f"largest |x_i|, .inf for none; leaving them is a failure [{UNIT}]")
+    state_limits: Limits = Field(
+        description=f"largest |x_i|, at most 1e6, or .inf for none; leaving them is a failure [{UNIT}]"
+    )
+
+    def problems(self) -> Iterator[Problem]:
+        for i, limit in enumerate(self.state_limits):
+            if LARGEST_LIMIT < limit < inf:
+                yield Problem(("state_limits", i), f"must be <= {LARGEST_LIMIT:g}, or .inf for none", limit)
 
 
 class WeightsConfig(Settings):
@@ -107,73 +120,86 @@ class WeightsConfig(Settings):
 
 
 class StepConfig(Settings):
-    min: float = Field(default=0.01, gt=0, description="shortest interval [s] (paper, section III)")
-    max: float = Field(default=0.1, gt=0, description="longest interval [s] (paper, section III)")
+    min: float = Field(default=0.01, ge=1e-6, le=1e3, description="shortest interval [s] (paper, section III)")
+    max: float = Field(default=0.1, ge=1e-6, le=1e3, description="longest interval [s] (paper, section III)")
 
     def problems(self) -> Iterator[Problem]:
-        if self.min >= self.max:
-            yield Problem(("min",), f"must be < max = {self.max:g}", self.min)
+        if self.min > self.max:
+            yield Problem(("min",), f"must be <= max = {self.max:g}; equal ones fix the duration", self.min)
 
 
 class TrajectoryConfig(Settings):
-    knots: int = Field(default=51, ge=3, description="knots N+1 of the nominal motion [-] (paper, section III)")
-    step: StepConfig = Field(default=StepConfig(), description="box of the one free step that all intervals share [s]")
-    time_weight: float = Field(default=0.1, ge=0, description="w_t, the cost of duration [1/s] (paper, section III)")
+    knots: int = Field(
+        default=51, ge=3, le=10_000, description="knots N+1 of the nominal motion [-] (paper, section III)"
+    )
+    step: StepConfig = Field(
+        default=StepConfig(),
+        description="box of the one step that all intervals share; a box without width fixes it [s]",
+    )
+    time_weight: float = Field(
+        default=0.1, ge=0, le=1e6, description="w_t, the cost of duration [1/s] (paper, section III)"
+    )
     substeps: int = Field(
-        default=5, ge=1, description="RK4 steps of dynamics and Riccati equation inside an interval [-]"
+        default=5, ge=1, le=1000, description="RK4 steps of dynamics and Riccati equation inside an interval [-]"
     )
     limit_share: float = Field(
         default=1.0,
-        gt=0,
+        ge=0.01,
         le=1,
         description="share of the state limits for the nominal motion; the rest is the funnel's [-]",
     )
-    max_iterations: int = Field(default=200, ge=1, description="iterations of the trajectory optimizer [-]")
+    max_iterations: int = Field(default=200, ge=1, le=100_000, description="iterations of the trajectory optimizer [-]")
     starts: int = Field(
         default=1, ge=1, le=2, description="starts to solve, the cheapest is kept; others replace those that fail [-]"
     )
 
 
-def _searchable(must: str, holds: Callable[[float], bool]) -> PlainValidator:
-    """Of a number that stays, or of a variable that the search moves."""
+@dataclass(frozen=True)
+class Option:
+    """A number of the policy that stays or, as a variable, is searched: its range, and whether on a log scale."""
 
-    def read(data: Any) -> float | Variable:
+    ge: float
+    le: float
+    logarithmic: bool = False
+
+    def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
+        return no_info_plain_validator_function(self._read, serialization=handler(source).get("serialization"))
+
+    def _read(self, data: Any) -> float | Variable:
         if isinstance(data, Mapping | Variable):
-            variable = Variable.model_validate(data)
-            ends = ((end, getattr(variable, end)) for end in ("min", "max"))
-            wrong = [Problem((end,), f"must be {must}", value) for end, value in ends if not holds(value)]
-            if wrong:
-                raise invalid(wrong)
-            return variable
-        if isinstance(data, bool) or not isinstance(data, int | float):
+            data = Variable.model_validate(data)
+            numbers = {(end,): getattr(data, end) for end in ("min", "max")}
+        elif isinstance(data, bool) or not isinstance(data, int | float):
             keys = ", ".join(Variable.model_fields)
             raise invalid([Problem((), f"must be a number, or a mapping with the keys {keys}", data)])
-        if not holds(data):
-            raise invalid([Problem((), f"must be {must}", data)])
-        return float(data)
-
-    return PlainValidator(read)
+        else:
+            numbers = {(): data}
+        text = f"must be >= {self.ge:g} and <= {self.le:g}"
+        wrong = [Problem(path, text, value) for path, value in numbers.items() if not self.ge <= value <= self.le]
+        if wrong:
+            raise invalid(wrong)
+        return data if isinstance(data, Variable) else float(data)
 
 
 Searchable = SerializeAsAny[float | Variable]
-Authority = Annotated[Searchable, _searchable("> 0 and <= 1", lambda a: 0 < a <= 1)]
-Discount = Annotated[Searchable, _searchable(">= 0 and finite", lambda a: 0 <= a < float("inf"))]
 
 
 class PolicyConfig(Settings):
     """What the tracking controller's Riccati equation changes of Q and R; the defaults are the paper's TVLQR.
 
-    `authority` and `discount` are numbers, or variables with their boxes: then the search chooses them, `authority` on
-    a log scale.
+    The options are numbers, or variables with their boxes: then the search chooses them.
     """
 
-    input_weight: float = Field(default=1.0, gt=0, description="R of the controller over that of the trajectory [-]")
-    authority: Authority = Field(
-        default=1.0,
-        description="R grows to R / max(1 - |u*| / u_max, authority)^2 where u* leaves little of the input [-] "
-        "(> 0 and <= 1)",
+    input_weight: Annotated[Searchable, Option(1e-9, 1e9, logarithmic=True)] = Field(
+        default=1.0, description="R of the controller over that of the trajectory [-]"
     )
-    discount: Discount = Field(default=0.0, description="alpha: V falls as if A were A + alpha I [1/s] (>= 0)")
+    authority: Annotated[Searchable, Option(1e-6, 1, logarithmic=True)] = Field(
+        default=1.0,
+        description="R grows to R / max(1 - |u*| / u_max, authority)^2 where u* leaves little of the input [-]",
+    )
+    discount: Annotated[Searchable, Option(0, 1000)] = Field(
+        default=0.0, description="alpha: V falls as if A were A + alpha I [1/s]"
+    )
 
     def variables(self) -> dict[str, Variable]:
         """Those of the options that are variables."""
@@ -184,28 +210,44 @@ class PolicyConfig(Settings):
         return {name: option.initial if isinstance(option, Variable) else option for name, option in self}
 
 
+MOST_STEPS = 100_000
+"""Of one rollout about the goal."""
+
+
 class GoalConfig(Settings):
     """The region of attraction of the goal's LQR, from which the last level follows."""
 
-    directions: int = Field(default=24, ge=1, description="quasi-random directions about the goal, in each round [-]")
-    radii: int = Field(default=6, ge=3, description="radii along each direction, in each round [-]")
-    rounds: int = Field(default=4, ge=1, description="rounds, each between two neighboring radii of the one before [-]")
-    horizon: float = Field(default=2.0, gt=0, description="time over which a rollout must come closer to the goal [s]")
-    step: float = Field(default=0.02, gt=0, description="RK4 step of these rollouts [s]")
+    directions: int = Field(
+        default=24, ge=1, le=100_000, description="quasi-random directions about the goal, in each round [-]"
+    )
+    radii: int = Field(default=6, ge=3, le=1000, description="radii along each direction, in each round [-]")
+    rounds: int = Field(
+        default=4, ge=1, le=20, description="rounds, each between two neighboring radii of the one before [-]"
+    )
+    horizon: float = Field(
+        default=2.0, ge=1e-3, le=1e3, description="time over which a rollout must come closer to the goal [s]"
+    )
+    step: float = Field(default=0.02, ge=1e-6, le=1e3, description="RK4 step of these rollouts [s]")
 
     def problems(self) -> Iterator[Problem]:
         if self.step >= self.horizon:
             yield Problem(("step",), f"must be < horizon = {self.horizon:g}", self.step)
+        elif self.horizon > MOST_STEPS * self.step:
+            yield Problem(("step",), f"must be >= horizon / {MOST_STEPS} = {self.horizon / MOST_STEPS:g}", self.step)
 
 
 class FunnelConfig(Settings):
     rollouts: Literal["closed_form", "mjx", "mixed"] = Field(default="mixed", description="dynamics of the rollouts")
     mjx_share: float = Field(default=0.01, ge=0, le=1, description="share of the fresh samples on MJX when mixed [-]")
-    directions: int = Field(default=12, ge=1, description="quasi-random directions at each knot [-]")
-    climbers: int = Field(default=4, ge=2, description="directions led to the worst one, from knot to knot [-]")
-    climbs: int = Field(default=3, ge=0, description="steps towards it, at each knot [-]")
-    steps: int = Field(default=5, ge=1, description="RK4 steps of a rollout inside an interval [-]")
-    trials: int = Field(default=32, ge=1, description="fresh uniform states of each ellipsoid, at each knot [-]")
+    directions: int = Field(default=12, ge=1, le=100_000, description="quasi-random directions at each knot [-]")
+    climbers: int = Field(
+        default=4, ge=2, le=10_000, description="directions led to the worst one, from knot to knot [-]"
+    )
+    climbs: int = Field(default=3, ge=0, le=1000, description="steps towards it, at each knot [-]")
+    steps: int = Field(default=5, ge=1, le=1000, description="RK4 steps of a rollout inside an interval [-]")
+    trials: int = Field(
+        default=32, ge=1, le=1_000_000, description="fresh uniform states of each ellipsoid, at each knot [-]"
+    )
     confidence: float = Field(default=0.99, gt=0, lt=1, description="1 - beta, jointly over the knots [-]")
     goal: GoalConfig = Field(default=GoalConfig(), description="region of attraction of the goal's LQR")
 
@@ -219,8 +261,10 @@ class FunnelConfig(Settings):
 class NestedConfig(Settings):
     """The paper's two loops: an outer search over designs, each with an inner search over weights."""
 
-    designs: int = Field(default=8, ge=4, description="outer population; the inner one is population / designs [-]")
-    generations: int = Field(default=10, ge=1, description="inner generations for each design [-]")
+    designs: int = Field(
+        default=8, ge=4, le=2**20, description="outer population; the inner one is population / designs [-]"
+    )
+    generations: int = Field(default=10, ge=1, le=1_000_000, description="inner generations for each design [-]")
 
 
 SMALLEST_POPULATION = 4
@@ -234,14 +278,20 @@ class SearchConfig(Settings):
     mode: Literal["joint", "nested"] = Field(
         default="joint", description="one search over all, or weights inside designs"
     )
-    population: int = Field(default=128, ge=SMALLEST_POPULATION, description="candidates in a generation [-]")
+    population: int = Field(default=128, ge=SMALLEST_POPULATION, le=2**20, description="candidates in a generation [-]")
     generations: int = Field(
-        default=60, ge=1, description="generations; each evaluates the whole population, also when nested [-]"
+        default=60,
+        ge=1,
+        le=1_000_000,
+        description="generations; each evaluates the whole population, also when nested [-]",
     )
-    sigma: float = Field(default=0.3, gt=0, le=1, description="initial step size in the unit box [-]")
+    sigma: float = Field(default=0.3, ge=1e-6, le=1, description="initial step size in the unit box [-]")
     seed: int = Field(default=0, ge=0, lt=2**32, description="of all random numbers [-]")
     chunk: int = Field(
-        default=64, ge=1, description="candidates that a device evaluates at once, which bounds its memory [-]"
+        default=64,
+        ge=1,
+        le=2**20,
+        description="candidates that a device evaluates at once, which bounds its memory [-]",
     )
     nested: NestedConfig = Field(
         default=NestedConfig(), description="budget of the two loops, used in mode nested alone"
@@ -259,13 +309,17 @@ class SearchConfig(Settings):
 
 
 class ElitesConfig(Settings):
-    count: int = Field(default=8, ge=1, description="candidates kept and evaluated again [-]")
+    count: int = Field(default=8, ge=1, le=10_000, description="candidates kept and evaluated again [-]")
     distance: float = Field(
         default=0.02, ge=0, lt=1, description="smallest distance between two of them in the unit box [-]"
     )
-    trials: int = Field(default=2000, ge=1, description="fresh states at each knot of their evaluation [-]")
-    directions: int = Field(default=192, ge=1, description="fresh directions at each knot of their evaluation [-]")
+    trials: int = Field(
+        default=2000, ge=1, le=100_000_000, description="fresh states at each knot of their evaluation [-]"
+    )
+    directions: int = Field(
+        default=192, ge=1, le=1_000_000, description="fresh directions at each knot of their evaluation [-]"
+    )
 
 
 class CheckpointConfig(Settings):
-    seconds: float = Field(default=20.0, ge=0, description="least time between two saves [s]")
+    seconds: float = Field(default=20.0, ge=0, le=1e6, description="least time between two saves [s]")

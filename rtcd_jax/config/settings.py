@@ -1,5 +1,6 @@
 """Frozen pydantic models that say what is wrong with their data in the words of `errors`."""
 
+import re
 from collections.abc import Iterable, Iterator
 from typing import Self, get_args
 
@@ -20,6 +21,7 @@ _KINDS = {
     "finite_number": "finite",
 }
 _BOUNDS = {"gt": ">", "ge": ">=", "lt": "<", "le": "<="}
+_UNIT = re.compile(r"\s*\[([^\[\]]+)\]")
 _BOUND_ERRORS = ("greater_than", "greater_than_equal", "less_than", "less_than_equal")
 
 
@@ -58,9 +60,26 @@ def problems_of(error: ValidationError) -> list[Problem]:
 
 
 def bounds(field: FieldInfo) -> str:
-    """The field's own range, such as `> 0 and <= 1`; empty if it has none."""
-    limits = ((sign, getattr(item, name, None)) for item in field.metadata for name, sign in _BOUNDS.items())
-    return " and ".join(f"{sign} {limit}" for sign, limit in limits if limit is not None)
+    """The field's own range or, of a list, that of its entries, such as `> 0 and <= 1`; empty if it has none."""
+    entries = (item for kind in get_args(field.annotation) for item in getattr(kind, "__metadata__", ()))
+    metadata = (*field.metadata, *(limit for entry in entries for limit in getattr(entry, "metadata", ())))
+    limits = ((sign, getattr(item, name, None)) for item in metadata for name, sign in _BOUNDS.items())
+    return " and ".join(f"{sign} {_number(limit)}" for sign, limit in limits if limit is not None)
+
+
+def unit(field: FieldInfo) -> str:
+    """The unit in brackets in the field's description; empty if it has none."""
+    found = _UNIT.search(str(field.description))
+    return found.group(1) if found else ""
+
+
+def without_unit(field: FieldInfo) -> str:
+    """The field's description but for its unit."""
+    return _UNIT.sub("", str(field.description), count=1)
+
+
+def _number(limit: float) -> str:
+    return str(limit) if isinstance(limit, int) else f"{limit:g}"
 
 
 def _line(problem: Problem) -> InitErrorDetails:
@@ -98,5 +117,5 @@ def _expectation(field: FieldInfo, details: ErrorDetails) -> str:
         return f"must be {_KINDS[kind]}"
     if kind in _BOUND_ERRORS:
         ((name, limit),) = ((name, limit) for name, limit in context.items() if name in _BOUNDS)
-        return f"must be {bounds(field) or f'{_BOUNDS[name]} {limit}'}"
+        return f"must be {bounds(field) or f'{_BOUNDS[name]} {_number(limit)}'}"
     return str(details["msg"])

@@ -12,13 +12,14 @@ held over a step, it would lag the loop by half of it, and that is another loop 
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import final
+from typing import Any, final
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.integrate import RK45
 
 from rtcd_jax.elite.elite import Elite
+from rtcd_jax.numerics.hermite import cubic_hermite
 from rtcd_jax.system.errors import UserError
 
 LEVEL_TOLERANCE = 1e-6
@@ -39,6 +40,51 @@ Policy = Callable[[float, np.ndarray], np.ndarray]
 """t, x [states n] -> u [states m]."""
 March = Callable[[Policy, float, float, np.ndarray], Iterator[np.ndarray]]
 """A policy, t0, t1 and x at t0 -> x after every step, the last time at t1."""
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class ClosedLoop:
+    """The policy of an elite; `rates` are x*' at both ends of every interval: f(x_k, u_k) and f(x_k+1, u_k)."""
+
+    elite: Elite
+    rates: Float[np.ndarray, "intervals 2 n"]
+
+    @classmethod
+    def of(cls, elite: Elite, f: Dynamics) -> "ClosedLoop":
+        """The policy about the motion that the dynamics `f` interpolate; they are asked for two states at a time."""
+        pairs = zip(elite.x[:-1], elite.x[1:], elite.u, strict=True)
+        return cls(elite, np.stack([f(np.stack([start, end]), np.stack([u, u])) for start, end, u in pairs]))
+
+    def duration(self, k: Any) -> Any:
+        """t_k+1 - t_k [s]."""
+        return self.elite.time[k + 1] - self.elite.time[k]
+
+    def nominal(self, k: Any, s: Any) -> Float[np.ndarray, "*T n"]:
+        """x* at the fractions s of the intervals k, one or [T]."""
+        x, h = self.elite.x, self.duration(k)
+        if np.ndim(s):
+            s, h = s[:, None], h[:, None]
+        return cubic_hermite(s, h, x[k], self.rates[k, 0], x[k + 1], self.rates[k, 1])
+
+    def gain(self, k: int, s: float) -> Float[np.ndarray, "m n"]:
+        """K at the fraction s of the interval k."""
+        return (1 - s) * self.elite.K[k] + s * self.elite.K[k + 1]
+
+    def tracking(self, k: int) -> Policy:
+        """The policy on [t_k, t_k+1]."""
+        elite, start, h = self.elite, self.elite.time[k], self.duration(k)
+
+        def policy(t: float, x: np.ndarray) -> np.ndarray:
+            s = (t - start) / h
+            return np.clip(elite.u[k] - (x - self.nominal(k, s)) @ self.gain(k, s).T, -elite.u_max, elite.u_max)
+
+        return policy
+
+    def holding(self) -> Policy:
+        """The goal's LQR."""
+        elite = self.elite
+        return lambda _, x: np.clip((elite.x_goal - x) @ elite.K_goal.T, -elite.u_max, elite.u_max)
 
 
 @final
@@ -71,7 +117,7 @@ def simulate(
 
     `f` are the dynamics that both integrate; here they give the slopes of x*(t) and the settling time.
     """
-    x = states.copy()
+    loop, x = ClosedLoop.of(elite, f), states.copy()
     left_funnel = np.zeros(len(x), bool)
     left_limits = _outside(elite, x)
 
@@ -86,7 +132,7 @@ def simulate(
 
     for k in range(len(elite.u)):
         moving = np.flatnonzero((knots <= k) & ~left_limits)
-        advance(march, moving, tracking(elite, f, k), elite.time[k], elite.time[k + 1])
+        advance(march, moving, loop.tracking(k), elite.time[k], elite.time[k + 1])
         level = elite.rho[k + 1] * (1 + LEVEL_TOLERANCE)
         left_funnel[moving] |= ~(elite.value(k + 1, x[moving]) <= level)
 
@@ -94,33 +140,8 @@ def simulate(
     interval = SETTLING_INTERVALS * (elite.time[-1] - elite.time[-2])
     for _ in range(math.ceil(settling_time(elite, f) / interval)):
         moving = np.flatnonzero(~left_limits & ~(elite.value_of_goal(x) <= FORGOTTEN * arrived))
-        advance(settle or march, moving, holding(elite), 0.0, interval)
+        advance(settle or march, moving, loop.holding(), 0.0, interval)
     return Outcome(left_funnel, left_limits, left_limits | ~(elite.value_of_goal(x) <= arrived))
-
-
-def tracking(elite: Elite, f: Dynamics, k: int) -> Policy:
-    """The policy on [t_k, t_k+1]."""
-    start, h = elite.time[k], elite.time[k + 1] - elite.time[k]
-    x0, x1 = elite.x[k : k + 2]
-    slope0, slope1 = h * f(elite.x[k : k + 2], np.stack([elite.u[k], elite.u[k]]))
-
-    def policy(t: float, x: np.ndarray) -> np.ndarray:
-        s = (t - start) / h
-        nominal = (
-            (1 + 2 * s) * (1 - s) ** 2 * x0
-            + s * (1 - s) ** 2 * slope0
-            + s**2 * (3 - 2 * s) * x1
-            - s**2 * (1 - s) * slope1
-        )
-        gain = (1 - s) * elite.K[k] + s * elite.K[k + 1]
-        return np.clip(elite.u[k] - (x - nominal) @ gain.T, -elite.u_max, elite.u_max)
-
-    return policy
-
-
-def holding(elite: Elite) -> Policy:
-    """The goal's LQR."""
-    return lambda _, x: np.clip((elite.x_goal - x) @ elite.K_goal.T, -elite.u_max, elite.u_max)
 
 
 def settling_time(elite: Elite, f: Dynamics) -> float:
@@ -153,15 +174,19 @@ def runge_kutta(f: Dynamics, longest_step: float) -> March:
         steps = math.ceil((end - start) / longest_step * (1 - 1e-12))
         dt = (end - start) / steps
         for step in range(steps):
-            t, middle, after = (start + (step + part) * dt for part in (0, 0.5, 1))
-            k1 = f(x, policy(t, x))
-            k2 = f(y := x + dt / 2 * k1, policy(middle, y))
-            k3 = f(y := x + dt / 2 * k2, policy(middle, y))
-            k4 = f(y := x + dt * k3, policy(after, y))
-            x = x + dt / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
+            x = runge_kutta_step(lambda part, x, step=step: f(x, policy(start + (step + part) * dt, x)), x, dt)
             yield x
 
     return march
+
+
+def runge_kutta_step(slope: Callable[[float, np.ndarray], np.ndarray], x: np.ndarray, dt: float) -> np.ndarray:
+    """x after one classical step of `dt`; `slope` has the fraction of the step and the state there."""
+    k1 = slope(0, x)
+    k2 = slope(0.5, x + dt / 2 * k1)
+    k3 = slope(0.5, x + dt / 2 * k2)
+    k4 = slope(1, x + dt * k3)
+    return x + dt / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
 
 
 def dormand_prince(f: Dynamics, longest_step: float, relative: float, absolute: float) -> March:

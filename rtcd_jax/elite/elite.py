@@ -1,23 +1,37 @@
-"""One elite as the run folder stores it: all that the verification knows of a funnel."""
+"""One stored elite in numpy: its motion, its controller, its funnel and what is promised; all verbs read it here."""
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any, final
 
 import numpy as np
 from jaxtyping import Float, Int
 
+from rtcd_jax.elite.records import INITIAL, elite_folder, elite_name, read_elite, require_elites
 from rtcd_jax.system.errors import UserError
+
+CLAIMED = "claimed"
+"""The guarantee of a funnel that somebody else states, below *sampled*."""
+
+
+class NoFunnel(UserError):
+    """A stored candidate has no funnel; `status` says why."""
+
+    def __init__(self, where: Path, status: str):
+        super().__init__(f"{where} has no funnel ({status})")
+        self.status = status
 
 
 @final
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Elite:
     """A funnel, what it controls and what it promises; arrays as in `elites/NNN.npz`, SI units.
 
     Promised with `confidence`: a state, uniform in its ellipsoid B_k = {x : V_k(x) <= rho_k}, fails with a
-    probability of at most `epsilon`.
+    probability of at most `epsilon`. `guarantee` says on what ground; a claimed funnel promises that no state fails.
+    `volumes` are the funnel's, by name, and `record` is all of `NNN.json`.
 
     Raises:
         UserError: shapes that do not belong together, or no funnel: a level or an S that is not positive.
@@ -25,6 +39,7 @@ class Elite:
 
     plant: str
     parameters: Mapping[str, float]
+    guarantee: str
     epsilon: float
     confidence: float
     time: Float[np.ndarray, " knots"]
@@ -33,16 +48,22 @@ class Elite:
     K: Float[np.ndarray, "knots m n"]
     S: Float[np.ndarray, "knots n n"]
     rho: Float[np.ndarray, " knots"]
+    Q: Float[np.ndarray, "n n"]
+    R: Float[np.ndarray, "m m"]
     K_goal: Float[np.ndarray, "m n"]
     x_goal: Float[np.ndarray, " n"]
     u_max: Float[np.ndarray, " m"]
     state_limits: Float[np.ndarray, " n"]
+    volumes_per_knot: Float[np.ndarray, " knots"]
+    volumes: Mapping[str, float] = field(default_factory=dict)
+    record: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self):
         knots, n, m = self.time.size, self.x_goal.size, self.u_max.size
         shapes = {
             "time": (knots,), "x": (knots, n), "u": (knots - 1, m), "K": (knots, m, n), "S": (knots, n, n),
-            "rho": (knots,), "K_goal": (m, n), "x_goal": (n,), "u_max": (m,), "state_limits": (n,),
+            "rho": (knots,), "Q": (n, n), "R": (m, m), "K_goal": (m, n), "x_goal": (n,), "u_max": (m,),
+            "state_limits": (n,), "volumes_per_knot": (knots,),
         }  # fmt: skip
         wrong = [f"{name} {getattr(self, name).shape}" for name in shapes if getattr(self, name).shape != shapes[name]]
         if wrong:
@@ -63,14 +84,50 @@ class Elite:
         Raises:
             UserError: something is missing, or as the class.
         """
-        told = {name: record.get(name) for name in ("plant", "parameters", "epsilon", "confidence")}
-        found = {**arrays, **told, "state_limits": record.get("state_limits")}
-        missing = [name for name in cls.__dataclass_fields__ if found.get(name) is None]
+        promise = {"epsilon": 0.0, "confidence": 1.0} if record.get("rung") == CLAIMED else {}
+        told = {name: record.get(name, promise.get(name)) for name in ("plant", "parameters", "epsilon", "confidence")}
+        told["guarantee"] = record.get("rung")
+        numbers = {name: np.asarray(arrays[name], float) for name in arrays.keys() & cls.__dataclass_fields__.keys()}
+        limits = record.get("state_limits")
+        if limits is not None:
+            numbers["state_limits"] = np.array([math.inf if limit is None else limit for limit in limits], float)
+        volumes = {
+            name.removeprefix("volumes_"): float(array)
+            for name, array in arrays.items()
+            if name.startswith("volumes_") and not array.ndim
+        }
+        fields: dict[str, Any] = {**told, **numbers, "volumes": volumes, "record": record}
+        stored = {"guarantee": "rung"}  # the field's key in NNN.json
+        missing = [stored.get(name, name) for name in cls.__dataclass_fields__ if fields.get(name) is None]
         if missing:
             raise UserError(f"the elite lacks {', '.join(missing)}")
-        limits = [math.inf if limit is None else limit for limit in found["state_limits"]]
-        numbers = {name: np.asarray(found[name], float) for name in arrays.keys() & cls.__dataclass_fields__.keys()}
-        return cls(**{**told, **numbers, "state_limits": np.asarray(limits, float)})
+        return cls(**fields)
+
+    @classmethod
+    def read(cls, run: Path, which: int | str) -> "Elite":
+        """An elite of a run folder, by its number or its name "000", "001", …, or its candidate "initial".
+
+        Raises:
+            NoFunnel: that candidate has none.
+            UserError: no run folder, a search that is not finished, no such elite (the error has those that are
+                there), damaged files, or as `of`.
+        """
+        name, there = elite_name(which), require_elites(run)
+        if name != INITIAL and name not in there:
+            raise UserError(f"{run} has no elite {name}; there are {', '.join(there)}")
+        folder = elite_folder(run, name)
+        arrays, record = read_elite(folder, name)
+        if record.get("status") != "OK":
+            raise NoFunnel(folder / name, str(record.get("status")))
+        try:
+            return cls.of(arrays, record)
+        except UserError as error:
+            raise UserError(f"{folder / name}: {error}") from None
+
+    @property
+    def policy(self) -> Mapping[str, float]:
+        """The policy's options by name; what is absent is as in the configuration's defaults."""
+        return self.record.get("policy", {})
 
     def value(self, k: int, x: Float[np.ndarray, "states n"]) -> Float[np.ndarray, " states"]:
         """V_k(x) = (x - x_k)' S_k (x - x_k)."""
@@ -93,9 +150,27 @@ class Elite:
         direction = random.normal(size=(len(knots), n))
         radius = random.uniform(size=(len(knots), 1)) ** (1 / n)
         ball = radius * direction / np.linalg.norm(direction, axis=1, keepdims=True)
-        # S = L L' makes V = |L' (x - x_k)|^2, so that x - x_k = sqrt(rho) L^-T y with |y| <= 1
-        axes = np.sqrt(self.rho)[:, None, None] * np.linalg.inv(np.linalg.cholesky(self.S))
-        return self.x[knots] + np.einsum("sji,sj->si", axes[knots], ball)
+        return self.x[knots] + np.einsum("sij,sj->si", ellipsoid_axes(self.S, self.rho)[knots], ball)
+
+
+def initial_and_best(run: Path) -> tuple[dict[str, Elite], str]:
+    """A run folder's initial candidate and its best elite, as "initial" and "best"; why the former is absent, if it is.
+
+    Raises UserError as `Elite.read`.
+    """
+    best = {"best": Elite.read(run, 0)}
+    if not (elite_folder(run, INITIAL) / f"{INITIAL}.json").is_file():
+        return best, "no initial candidate was stored"
+    try:
+        return {INITIAL: Elite.read(run, INITIAL), **best}, ""
+    except NoFunnel as error:
+        return best, f"the initial candidate has no funnel ({error.status})"
+
+
+def ellipsoid_axes(S: Float[np.ndarray, "... n n"], rho: Float[np.ndarray, "..."]) -> Float[np.ndarray, "... n n"]:
+    """A with {x'S x <= rho} = {A y : |y| <= 1}."""
+    # S = L L' makes x'S x = |L'x|^2, so that x = sqrt(rho) L^-T y
+    return np.sqrt(rho)[..., None, None] * np.swapaxes(np.linalg.inv(np.linalg.cholesky(S)), -2, -1)
 
 
 def _quadratic(weight: np.ndarray, error: np.ndarray) -> np.ndarray:

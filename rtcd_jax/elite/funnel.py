@@ -10,95 +10,73 @@ After t_N the goal, its LQR's S_N, and rho_N. Errors x - x*(t) of angles are not
 at the knots; between them this is the interpolation that proofs begin from.
 """
 
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, final
+from typing import final
 
 import numpy as np
 from jaxtyping import Float
 
-from rtcd_jax.elite.closed_loop import Dynamics
+from rtcd_jax.elite.closed_loop import ClosedLoop, Dynamics
 from rtcd_jax.elite.elite import Elite
-from rtcd_jax.elite.simulators import CLOSED_FORMS
+from rtcd_jax.elite.simulators import dynamics_of
 from rtcd_jax.numerics.hermite import cubic_hermite
-from rtcd_jax.system.errors import UserError
 
 STEP = 1e-5
 """Of the central differences, in SI units."""
 
 
 @final
-@dataclass(frozen=True)
-class Tube:
-    """`elite` with the rates of x* and of S at both ends of every interval."""
+@dataclass(frozen=True, eq=False)
+class FunnelInterpolant:
+    """The funnel of `loop`'s elite; `value_rates` are S' at both ends of every interval."""
 
-    elite: Elite
-    rates: Float[np.ndarray, "intervals 2 n"]
-    slopes: Float[np.ndarray, "intervals 2 n n"]
+    loop: ClosedLoop
+    value_rates: Float[np.ndarray, "intervals 2 n n"]
 
     @classmethod
-    def of(cls, arrays: Mapping[str, np.ndarray], record: Mapping[str, Any]) -> "Tube":
-        """The funnel of a stored candidate. Raises UserError if it has none, or its record is incomplete."""
-        elite = Elite.of(arrays, record)
-        missing = [name for name in ("Q", "R") if name not in arrays]
-        if missing:
-            raise UserError(f"the elite lacks {', '.join(missing)}")
+    def of(cls, elite: Elite) -> "FunnelInterpolant":
+        """The funnel of an elite, by the plant's closed form where there is one."""
         f = dynamics_of(elite)
         ends = np.stack([elite.x[:-1], elite.x[1:]], axis=1)
         inputs = np.stack([elite.u, elite.u], axis=1)
-        flat = ends.reshape(-1, ends.shape[2]), inputs.reshape(-1, inputs.shape[2])
-        a, b = linearized(f, *flat)
-        S = np.stack([elite.S[:-1], elite.S[1:]], axis=1).reshape(a.shape)
-        weights = _input_weights(elite, np.diag(arrays["R"]), record.get("policy", {}), flat[1])
-        a = a + record.get("policy", {}).get("discount", 0.0) * np.eye(a.shape[1])
-        gain = S @ b
-        falls = np.swapaxes(a, 1, 2) @ S + S @ a - (gain / weights[:, None]) @ np.swapaxes(gain, 1, 2) + arrays["Q"]
-        return cls(elite, f(*flat).reshape(ends.shape), -falls.reshape(*ends.shape, -1))
+        a, b = linearized(f, ends.reshape(-1, ends.shape[2]), inputs.reshape(-1, inputs.shape[2]))
+        shape = ends.shape[:2]
+        rates = value_rates(elite, a.reshape(*shape, *a.shape[1:]), b.reshape(*shape, *b.shape[1:]))
+        return cls(ClosedLoop.of(elite, f), rates)
+
+    @property
+    def elite(self) -> Elite:
+        return self.loop.elite
 
     def nominal(self, time: Float[np.ndarray, " T"]) -> Float[np.ndarray, "T n"]:
         """x*(t)."""
-        k, share, after = self._place(time)
-        x, rates = self.elite.x, self.rates
-        found = cubic_hermite(share[:, None], self._duration(k)[:, None], x[k], rates[k, 0], x[k + 1], rates[k, 1])
-        return np.where(after[:, None], self.elite.x_goal, found)
+        k, s, after = self._interval(time)
+        return np.where(after[:, None], self.elite.x_goal, self.loop.nominal(k, s))
 
     def value(self, time: Float[np.ndarray, " T"]) -> Float[np.ndarray, "T n n"]:
         """S(t)."""
-        k, share, after = self._place(time)
-        S, slopes = self.elite.S, self.slopes
-        at = share[:, None, None], self._duration(k)[:, None, None]
-        return np.where(after[:, None, None], S[-1], cubic_hermite(*at, S[k], slopes[k, 0], S[k + 1], slopes[k, 1]))
+        k, s, after = self._interval(time)
+        S, rates = self.elite.S, self.value_rates
+        fraction, duration = s[:, None, None], self.loop.duration(k)[:, None, None]
+        between = cubic_hermite(fraction, duration, S[k], rates[k, 0], S[k + 1], rates[k, 1])
+        return np.where(after[:, None, None], S[-1], between)
 
     def level(self, time: Float[np.ndarray, " T"]) -> Float[np.ndarray, " T"]:
         """rho(t)."""
-        k, share, _ = self._place(time)
+        k, s, _ = self._interval(time)
         logs = np.log(self.elite.rho)
-        return np.exp((1 - share) * logs[k] + share * logs[k + 1])
+        return np.exp((1 - s) * logs[k] + s * logs[k + 1])
 
-    def fill(self, time: Float[np.ndarray, " T"], x: Float[np.ndarray, "T n"]) -> Float[np.ndarray, " T"]:
+    def ratio(self, time: Float[np.ndarray, " T"], x: Float[np.ndarray, "T n"]) -> Float[np.ndarray, " T"]:
         """V(t, x) / rho(t): at most 1 inside the funnel, 0 on the nominal motion."""
         error = x - self.nominal(time)
         return np.einsum("ti,tij,tj->t", error, self.value(time), error) / self.level(time)
 
-    def _place(self, time: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """The interval, the share of it, and whether the motion is over, at which share is 1."""
+    def _interval(self, time: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """The interval, the fraction of it, and whether the motion is over; then the fraction is 1."""
         knots = self.elite.time
         k = np.clip(np.searchsorted(knots, time, side="right") - 1, 0, len(knots) - 2)
-        share = np.clip((time - knots[k]) / self._duration(k), 0, 1)
-        return k, share, time >= knots[-1]
-
-    def _duration(self, k: np.ndarray) -> np.ndarray:
-        return self.elite.time[k + 1] - self.elite.time[k]
-
-
-def dynamics_of(elite: Elite) -> Dynamics:
-    """The plant's closed form, or C MuJoCo where there is none."""
-    if elite.plant in CLOSED_FORMS:
-        return CLOSED_FORMS[elite.plant](elite.parameters)
-    from rtcd_jax.plants.mjx import CpuDynamics, model_of
-
-    columns = elite.x_goal.size + elite.u_max.size
-    return CpuDynamics(model_of(elite.plant, elite.parameters), 2 * columns * len(elite.time))
+        return k, np.clip((time - knots[k]) / self.loop.duration(k), 0, 1), time >= knots[-1]
 
 
 def linearized(
@@ -114,7 +92,22 @@ def linearized(
     return both[:, :, :n], both[:, :, n:]
 
 
-def _input_weights(elite: Elite, r: np.ndarray, policy: Mapping[str, float], u: np.ndarray) -> np.ndarray:
-    """The diagonal of the controller's R [K m] at feed-forwards [K m], as the policy defines it."""
-    left = np.maximum(1 - np.abs(u) / elite.u_max, policy.get("authority", 1.0))
-    return policy.get("input_weight", 1.0) * r / left**2
+def value_rates(
+    elite: Elite, a: Float[np.ndarray, "intervals 2 n n"], b: Float[np.ndarray, "intervals 2 n m"]
+) -> Float[np.ndarray, "intervals 2 n n"]:
+    """S' at both ends of every interval by the policy's own Riccati equation, from A and B there.
+
+    The options are those of `rtcd_jax.policy`: A is A + discount I, and R is R input_weight / max(1 - |u*| / u_max,
+    authority)^2.
+    """
+    options = elite.policy
+    left = np.maximum(1 - np.abs(elite.u) / elite.u_max, options.get("authority", 1.0))
+    weights = options.get("input_weight", 1.0) * np.diag(elite.R) / left**2
+    a = a + options.get("discount", 0.0) * np.eye(a.shape[-1])
+    return riccati_rate(np.stack([elite.S[:-1], elite.S[1:]], axis=1), a, b, elite.Q, weights[:, None])
+
+
+def riccati_rate(S: np.ndarray, a: np.ndarray, b: np.ndarray, q: np.ndarray, weights: np.ndarray) -> np.ndarray:
+    """S' = -(A'S + S A - S B R^-1 B'S + Q) [... n n]; `weights` [... m] is the diagonal of R."""
+    gain = S @ b
+    return -(np.swapaxes(a, -2, -1) @ S + S @ a - (gain / weights[..., None, :]) @ np.swapaxes(gain, -2, -1) + q)

@@ -24,10 +24,22 @@ from rtcd_jax.system.files import read_json, reading, replace, replace_json
 
 FORMAT = "rtcd_jax run"
 VERSION = 1
+INITIAL = "initial"
+"""Name of the configuration's candidate beside the elites "000", "001", …."""
 _RESTORE = "restore it, or make the run again"
 
 Arrays = Mapping[str, np.ndarray]
 Record = Mapping[str, Any]
+
+
+def elite_name(which: int | str) -> str:
+    """ "007" for 7; a name stays as it is."""
+    return which if isinstance(which, str) else f"{which:03d}"
+
+
+def elite_folder(run: Path, name: str) -> Path:
+    """Where in a run folder the files of the elite "000", "001", … or of the candidate "initial" lie."""
+    return run if name == INITIAL else run / "elites"
 
 
 def write_elite(folder: Path, name: str, arrays: Arrays, record: Record) -> None:

@@ -1,4 +1,4 @@
-"""Who simulates a plant for a verification: dynamics and integrators that share nothing with the search."""
+"""Independent simulators of a plant: dynamics and integrators that share nothing with the search."""
 
 from collections.abc import Callable, Iterator, Mapping
 from typing import NamedTuple, final
@@ -17,8 +17,8 @@ RELATIVE, ABSOLUTE = 1e-8, 1e-9
 
 
 @final
-class Witness(NamedTuple):
-    """Someone who simulates a plant: `march` along the trajectory, `settle` at the goal."""
+class Simulator(NamedTuple):
+    """Dynamics of a plant with its integrators: `march` along the trajectory, `settle` at the goal."""
 
     name: str
     dynamics: Dynamics
@@ -26,8 +26,8 @@ class Witness(NamedTuple):
     settle: March
 
 
-def witnesses(elite: Elite, states: int) -> Iterator[Witness]:
-    """Everyone who can simulate this elite's plant, `states` at most.
+def simulators_of(elite: Elite, states: int) -> Iterator[Simulator]:
+    """All that can simulate this elite's plant, `states` at most at once.
 
     Raises:
         ValueError: an unknown plant.
@@ -39,16 +39,26 @@ def witnesses(elite: Elite, states: int) -> Iterator[Witness]:
     mujoco = CpuDynamics(model_of(elite.plant, elite.parameters), max(states, 2 * columns))
     step = min(interval / STEPS, STEP_OF_FASTEST / fastest_rate(elite, mujoco))
     slow_step = STEP_OF_FASTEST / fastest_rate_of_goal(elite, mujoco)
-    yield Witness("C MuJoCo", mujoco, runge_kutta(mujoco, step), runge_kutta(mujoco, slow_step))
+    yield Simulator("C MuJoCo", mujoco, runge_kutta(mujoco, step), runge_kutta(mujoco, slow_step))
     if elite.plant in CLOSED_FORMS:
         closed_form = CLOSED_FORMS[elite.plant](elite.parameters)
         march = dormand_prince(closed_form, interval / 4, RELATIVE, ABSOLUTE)
-        yield Witness("closed form", closed_form, march, march)
+        yield Simulator("closed form", closed_form, march, march)
 
 
-def witness(elite: Elite, name: str, states: int) -> Witness:
+def simulator_of(elite: Elite, name: str, states: int) -> Simulator:
     """The one of that name."""
-    return next(found for found in witnesses(elite, states) if found.name == name)
+    return next(simulator for simulator in simulators_of(elite, states) if simulator.name == name)
+
+
+def dynamics_of(elite: Elite) -> Dynamics:
+    """The plant's closed form, or C MuJoCo where there is none."""
+    if elite.plant in CLOSED_FORMS:
+        return CLOSED_FORMS[elite.plant](elite.parameters)
+    from rtcd_jax.plants.mjx import CpuDynamics, model_of
+
+    columns = elite.x_goal.size + elite.u_max.size
+    return CpuDynamics(model_of(elite.plant, elite.parameters), 2 * columns * len(elite.time))
 
 
 def _pendulum(p: Mapping[str, float]) -> Dynamics:
@@ -80,4 +90,4 @@ def _cartpole(p: Mapping[str, float]) -> Dynamics:
 
 
 CLOSED_FORMS: dict[str, Callable[[Mapping[str, float]], Dynamics]] = {"pendulum": _pendulum, "cartpole": _cartpole}
-"""By plant: its physical numbers -> dynamics. A plant that is not here has one witness, C MuJoCo."""
+"""By plant: its physical numbers -> dynamics. A plant that is not here has one simulator, C MuJoCo."""

@@ -7,7 +7,9 @@ mean the closed loop that the run has sampled: x*(t) cubic Hermite, K linear, af
 import hashlib
 import io
 import json
-from collections.abc import Iterator, Mapping
+import os
+import re
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -15,7 +17,7 @@ import jax
 import numpy as np
 import yaml
 
-from rtcd_jax.elite.records import require_elites
+from rtcd_jax.elite.records import elite_name
 from rtcd_jax.export import robot, source, tables
 from rtcd_jax.export.bundle import Bundle, certificate_path, read_bundle
 from rtcd_jax.system.errors import UserError
@@ -31,60 +33,98 @@ class Console(Protocol):
     def message(self, text: str, /) -> None: ...
 
 
-def export_run(folder: Path, elite: int | str, target: Path, console: Console) -> None:
+def export_run(folder: Path, elite: int | str, target: Path, console: Console, label: str | None = None) -> None:
     """Writes one elite of a run folder, by number or "initial", into `target`: a new, empty or former export folder.
+
+    `label` names the controller's files and symbols, by default after robot and elite.
 
     Raises:
         UserError: no run folder, no such elite, one without a funnel, or a target that holds something else.
     """
-    name = elite if isinstance(elite, str) else f"{elite:03d}"
-    there = require_elites(folder)
-    if name != "initial" and name not in there:
-        raise UserError(f"{folder} has no elite {name}; there are {', '.join(there)}")
-    former = _claim(target)
-    bundle = read_bundle(folder, name)
+    former = _former(target)
+    bundle = read_bundle(folder, elite_name(elite), label)
     contents = _files(folder, bundle)
+    _require_ours(target, former, contents)
+    digests = {file: _digest(content) for file, content in contents.items()}
+    stale = {file: digest for file, digest in former.items() if file not in contents}
     with writing(target):
         target.mkdir(parents=True, exist_ok=True)
-        for leftover in target.glob(".*.tmp"):
-            leftover.unlink()
-    digests = {file: hashlib.sha256(content).hexdigest() for file, content in contents.items()}
+        for file in contents:
+            (target / f".{file}.tmp").unlink(missing_ok=True)
     # Written twice, so that a folder that a kill has left half old and half new says so.
-    _mark(target, complete=False, files=digests)
+    _mark(target, bundle, complete=False, files=stale | digests)
     for file, content in contents.items():
         replace(target / file, content)
-    with writing(target):
-        for stale in former - contents.keys():
-            (target / stale).unlink(missing_ok=True)
-    _mark(target, complete=True, files=digests)
-    for line in _summary(bundle, target, bool(former)):
+    kept = [file for file, digest in stale.items() if not _remove(target / file, digest)]
+    _mark(target, bundle, complete=True, files=digests)
+    for line in _summary(bundle, target, bool(former), kept):
         console.message(line)
 
 
-def _claim(target: Path) -> frozenset[str]:
-    """The files of the export that `target` holds already; nothing else may be replaced."""
+def _former(target: Path) -> dict[str, str]:
+    """The files of the export that `target` holds already, with their digests; nothing else may be replaced.
+
+    Raises:
+        UserError: `target` is a file, or a folder with something else in it.
+    """
     if target.exists() and not target.is_dir():
         raise UserError(f"{target} is a file: an export needs a folder")
     if not target.is_dir():
-        return frozenset()
+        return {}
     mark = target / MARK
-    if mark.is_file():
+    if mark.is_file() and not mark.is_symlink():
         try:
             stored = json.loads(mark.read_bytes())
             if stored["format"] == FORMAT:
-                return frozenset(stored["files"])
-        except (ValueError, KeyError, TypeError, OSError):
+                return {name: str(digest) for name, digest in stored["files"].items() if _is_plain(name)}
+        except (ValueError, KeyError, TypeError, AttributeError, RecursionError, OSError):
             pass
     foreign = sorted(item.name for item in target.iterdir() if not is_temporary(item))
     if foreign:
         raise UserError(
             f"{target} is not empty and no former export: it has {', '.join(foreign[:5])}; choose another one"
         )
-    return frozenset()
+    return {}
 
 
-def _mark(target: Path, complete: bool, files: Mapping[str, str]) -> None:
-    replace_json(target / MARK, {"format": FORMAT, "version": VERSION, "complete": complete, "files": files})
+def _is_plain(name: str) -> bool:
+    """True for the name of a file directly inside a folder, on any system."""
+    return name not in ("", ".", "..", MARK) and not re.search(r"[/\\:\0]", name)
+
+
+def _require_ours(target: Path, former: Mapping[str, str], contents: Mapping[str, bytes]) -> None:
+    """Raises UserError where a file would be replaced that no export has written."""
+    foreign = [file for file in contents if file not in former and os.path.lexists(target / file)]
+    if foreign:
+        raise UserError(
+            f"{target} has {', '.join(foreign[:5])}, which the former export has not written: "
+            "move it away, or choose another folder"
+        )
+
+
+def _remove(path: Path, digest: str) -> bool:
+    """Deletes a file that is still as a former export has written it; True if nothing is there any more."""
+    if not os.path.lexists(path):
+        return True
+    with writing(path):
+        if path.is_symlink() or not path.is_file() or _digest(path.read_bytes()) != digest:
+            return False
+        path.unlink()
+    return True
+
+
+def _digest(content: bytes) -> str:
+    return hashlib.sha256(content).hexdigest()
+
+
+def _mark(target: Path, bundle: Bundle, complete: bool, files: Mapping[str, str]) -> None:
+    about = {
+        "name": bundle.label,
+        "plant": bundle.elite.plant,
+        "elite": bundle.name,
+        "claim": bundle.proof.claim or None,
+    }
+    replace_json(target / MARK, {"format": FORMAT, "version": VERSION, "complete": complete, **about, "files": files})
 
 
 def _files(folder: Path, bundle: Bundle) -> dict[str, bytes]:
@@ -92,20 +132,20 @@ def _files(folder: Path, bundle: Bundle) -> dict[str, bytes]:
     described = bundle.describe()
     texts = {
         "README.md": source.readme(bundle, described),
-        "controller.json": json.dumps(plain(described), indent=2, ensure_ascii=False, allow_nan=False) + "\n",
+        f"{bundle.label}_controller.json": json.dumps(plain(described), indent=2, ensure_ascii=False, allow_nan=False)
+        + "\n",
         "parameters.yaml": _parameters(bundle, described),
         "trajectory.csv": tables.trajectory(bundle),
         "gains.csv": tables.gains(bundle),
         "funnel.csv": tables.funnel(bundle),
         "test_vectors.csv": tables.vectors(bundle),
-        "controller_size.h": source.size_header(bundle),
-        "controller_data.h": source.data_header(bundle),
-        **{name: source.template(name) for name in source.COPIED},
+        **source.sources(bundle),
         **_robot(bundle),
     }
     archive = io.BytesIO()
     np.savez(archive, **bundle.arrays())  # type: ignore[arg-type]
-    contents = {name: text.encode() for name, text in texts.items()} | {"controller.npz": archive.getvalue()}
+    contents = {name: text.encode() for name, text in texts.items()}
+    contents[f"{bundle.label}_controller.npz"] = archive.getvalue()
     if bundle.certificate:
         contents["certificate.json"] = certificate_path(folder, bundle.name).read_bytes()
     return contents
@@ -128,12 +168,14 @@ def _parameters(bundle: Bundle, described: Mapping[str, Any]) -> str:
     return yaml.safe_dump(plain({**kept, "parameters": numbers}), sort_keys=False, default_flow_style=None, width=120)
 
 
-def _summary(bundle: Bundle, target: Path, again: bool) -> Iterator[str]:
-    plant, rung, certificate = bundle.elite.plant, bundle.record["rung"], bundle.certificate
+def _summary(bundle: Bundle, target: Path, again: bool, kept: Sequence[str]) -> Iterator[str]:
+    plant, rung, certificate = bundle.elite.plant, bundle.elite.guarantee, bundle.certificate
     verb = "replaces the former export" if again else "is"
     yield f"{plant}, elite {bundle.name} with its {rung} funnel, {verb} in {target}"
     if certificate:
         yield f"certificate: rung {certificate['rung'] or 'unknown'}, in {target / 'certificate.json'}"
     else:
         yield "certificate: none; `rtcd certify` proves the funnel"
-    yield f"test it: python {target / 'controller.py'}"
+    if kept:
+        yield f"left where they are, for they were changed since the former export: {', '.join(kept)}"
+    yield f"test it: python {target / f'{bundle.label}_controller.py'}"

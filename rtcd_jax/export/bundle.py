@@ -3,6 +3,7 @@
 import hashlib
 import json
 import math
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,12 +11,12 @@ from typing import Any, NamedTuple, final
 
 import jax
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Int
 
 from rtcd_jax.elite.closed_loop import fastest_rate
-from rtcd_jax.elite.elite import Elite
-from rtcd_jax.elite.funnel import Tube
-from rtcd_jax.elite.records import read_elite
+from rtcd_jax.elite.elite import Elite, ellipsoid_axes
+from rtcd_jax.elite.funnel import FunnelInterpolant
+from rtcd_jax.export.proof import ProvedFunnel
 from rtcd_jax.plants import plant_class
 from rtcd_jax.plants.base import Plant
 from rtcd_jax.plants.mjx import CpuDynamics, model_of
@@ -30,13 +31,13 @@ RATES = 50.0
 
 
 class Instant(NamedTuple):
-    """The loop at one time: x* [n], u* [m], K [m n], S [n n] and rho []."""
+    """The loop at one time: x* [n], u* [m], K [m n], and the funnel {x* + axes y : |y| <= 1}, proved or not."""
 
     x: np.ndarray
     u: np.ndarray
     gain: np.ndarray
-    value: np.ndarray
-    level: float
+    axes: np.ndarray
+    proved: bool
 
 
 @final
@@ -44,49 +45,53 @@ class Instant(NamedTuple):
 class Bundle:
     """An elite with its funnel at every instant, the robot that it is for, and MuJoCo's model of it.
 
-    `joints` [m] says which joint an input drives; `volumes` [knots] are the ellipsoids'.
+    `joints` [m] says which joint an input drives; `label` names the controller's files and symbols.
     """
 
     name: str
-    tube: Tube
-    record: Mapping[str, Any]
+    label: str
+    funnel: FunnelInterpolant
     certificate: Mapping[str, Any] | None
     plant: Plant
     design: Any
     model: Any
-    volumes: Float[np.ndarray, " knots"]
     joints: Int[np.ndarray, " m"]
+    proof: ProvedFunnel
 
     @property
     def elite(self) -> Elite:
-        return self.tube.elite
+        return self.funnel.elite
 
     def at(self, t: float) -> Instant:
-        """The loop at a time t >= 0: u* held, K linear, x*, S and rho as in `report.tube`; the goal's from t_N on."""
-        elite, dt, now = self.elite, self.elite.time[1], np.array([t])
-        x, value, level = self.tube.nominal(now)[0], self.tube.value(now)[0], float(self.tube.level(now)[0])
-        if t >= elite.time[-1]:
-            return Instant(x, np.zeros_like(elite.u_max), elite.K_goal, value, level)
-        k = min(int(t / dt), len(elite.u) - 1)
-        s = t / dt - k
-        return Instant(x, elite.u[k], (1 - s) * elite.K[k] + s * elite.K[k + 1], value, level)
+        """The loop at a time t >= 0: u* held, K linear, x* and the funnel's axes; the goal's from t_N on."""
+        elite, funnel, dt, now = self.elite, self.funnel, self.elite.time[1], np.array([t])
+        x, after = funnel.nominal(now)[0], t >= elite.time[-1]
+        k = len(elite.u) if after else min(int(t / dt), len(elite.u) - 1)
+        s = 0.0 if after else t / dt - k
+        proved = self.proof.at(k + s)
+        axes = ellipsoid_axes(funnel.value(now), funnel.level(now))[0] if proved is None else proved
+        if after:
+            return Instant(x, np.zeros_like(elite.u_max), elite.K_goal, axes, proved is not None)
+        return Instant(x, elite.u[k], funnel.loop.gain(k, s), axes, proved is not None)
 
     def arrays(self) -> dict[str, np.ndarray]:
-        """What `controller.npz` holds, SI units."""
+        """What the controller's npz holds, SI units."""
         elite = self.elite
         kept = {name: getattr(elite, name) for name in ("time", "x", "u", "K", "S", "rho", "K_goal", "x_goal", "u_max")}
-        more = {"x_rates": self.tube.rates, "S_rates": self.tube.slopes, "state_limits": elite.state_limits}
-        return kept | more | {"input_joints": self.joints}
+        more = {"x_rates": self.funnel.loop.rates, "S_rates": self.funnel.value_rates}
+        proof = {"proof_begins": self.proof.begins, "proof_axes": self.proof.axes}
+        return kept | more | {"state_limits": elite.state_limits, "input_joints": self.joints} | proof
 
     def describe(self) -> dict[str, Any]:
-        """What `controller.json` holds: units, signs, limits, control rate, origin, and what is promised."""
-        elite, record = self.elite, self.record
+        """What the controller's JSON holds: units, signs, limits, control rate, origin, and what is promised."""
+        elite, record = self.elite, self.elite.record
         named_states, named_inputs = (record["units"][kind].items() for kind in ("states", "inputs"))
         states = zip(named_states, elite.state_limits, strict=True)
         inputs = zip(named_inputs, elite.u_max, self.joints, strict=True)
         return {
             "plant": elite.plant,
             "elite": self.name,
+            "name": self.label,
             "config_hash": record["config_hash"],
             "design": record["design"],
             "parameters": elite.parameters,
@@ -100,7 +105,7 @@ class Bundle:
             "time": {"unit": "s", "knots": elite.time.size, "dt": elite.time[1], "duration": elite.time[-1]},
             "control_rate": {"unit": "Hz", "least": least_rate(self), "rule": RULE},
             "funnel": {
-                "rung": record["rung"],
+                "rung": elite.guarantee,
                 "epsilon": elite.epsilon,
                 "confidence": elite.confidence,
                 "volumes": record["volumes"],
@@ -111,31 +116,34 @@ class Bundle:
         }
 
 
-def read_bundle(folder: Path, name: str) -> Bundle:
-    """The elite `name` ("000", ... or "initial") of a run folder.
+def read_bundle(folder: Path, name: str, label: str | None = None) -> Bundle:
+    """The elite `name` ("000", ... or "initial") of a run folder, to be exported as `label`, by default PLANT_NAME.
 
     Raises:
-        UserError: it is not there, cannot be read or has no funnel.
+        UserError: it is not there, cannot be read or has no funnel; a label that is no name in Python and C.
     """
-    arrays, record = read_elite(folder if name == "initial" else folder / "elites", name)
-    if record.get("status") != "OK":
-        raise UserError(f"{name} has no funnel to export ({record.get('status')}); choose another elite")
-    tube = Tube.of(arrays, record)
-    elite = tube.elite
+    elite = Elite.read(folder, name)
     with jax.enable_x64(True):
         plant, design = plant_class(elite.plant).from_parameters(elite.parameters)
     model = model_of(elite.plant, elite.parameters)
     return Bundle(
         name=name,
-        tube=tube,
-        record=record,
+        label=_label(label or f"{elite.plant}_{name}"),
+        funnel=FunnelInterpolant.of(elite),
         certificate=_certificate(folder, name, elite),
         plant=plant,
         design=design,
         model=model,
-        volumes=arrays["volumes_per_knot"],
         joints=model.actuator_trnid[:, 0].copy(),
+        proof=ProvedFunnel.none(elite.x_goal.size),
     )
+
+
+def _label(text: str) -> str:
+    """`text` if files, Python's modules and C's symbols can be called so."""
+    if not re.fullmatch(r"[A-Za-z][A-Za-z0-9_]{0,63}", text):
+        raise UserError(f"name {text!r}: must be a letter and up to 63 letters, digits and _, as pendulum_000")
+    return text
 
 
 def least_rate(bundle: Bundle) -> float:

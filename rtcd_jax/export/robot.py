@@ -64,6 +64,8 @@ def urdf(name: str, model: Any, state_limits: Sequence[float], input_limits: Seq
     motors = dict(zip(model.actuator_trnid[:, 0].tolist(), input_limits, strict=True))
     for body in range(1, model.nbody):
         robot.append(_joint(model, body, state_limits, motors))
+    for motor, joint in enumerate(model.actuator_trnid[:, 0].tolist()):
+        robot.append(_transmission(model.actuator(motor).name or f"motor_{motor}", model.joint(joint).name))
     return _text(robot)
 
 
@@ -133,6 +135,18 @@ def _joint(model: Any, body: int, state_limits: Sequence[float], motors: Mapping
         limit |= {"lower": _numbers(-reach), "upper": _numbers(reach)}
     Xml.SubElement(joint, "limit", limit)
     return joint
+
+
+def _transmission(motor: str, joint: str) -> Xml.Element:
+    """A motor without gears on a joint: where Drake and ROS look for a robot's inputs."""
+    transmission = Xml.Element("transmission", name=f"{motor}_transmission")
+    Xml.SubElement(transmission, "type").text = "transmission_interface/SimpleTransmission"
+    driven = Xml.SubElement(transmission, "joint", name=joint)
+    Xml.SubElement(driven, "hardwareInterface").text = "hardware_interface/EffortJointInterface"
+    actuator = Xml.SubElement(transmission, "actuator", name=motor)
+    Xml.SubElement(actuator, "hardwareInterface").text = "hardware_interface/EffortJointInterface"
+    Xml.SubElement(actuator, "mechanicalReduction").text = "1"
+    return transmission
 
 
 def _origin(position: np.ndarray, quaternion: np.ndarray) -> Xml.Element:

@@ -10,17 +10,38 @@ import numpy as np
 from rtcd_jax.export.bundle import Bundle
 
 TEMPLATES = files("rtcd_jax.export") / "templates"
-COPIED = ("controller.py", "controller.h", "controller.c", "controller_test.c")
-"""Templates that are the same for every robot."""
+PREFIX = "rtcd_"
+"""Of the templates' files and symbols; the export's own name takes its place: two exports live in one program."""
+_COPIED = ("controller.py", "controller.h", "controller.c", "controller_test.c")
+_CLAIMS = {"controller.py": 'CLAIM = ""', "controller.c": 'claim[] = ""'}
 
 
-def template(name: str) -> str:
-    """A file of the folder `templates`."""
+def sources(bundle: Bundle) -> dict[str, str]:
+    """The controller's files by name: what is the same for every robot but for names, and the numbers' headers."""
+    texts = {PREFIX + name: _with_claim(name, bundle) for name in _COPIED}
+    texts |= {f"{PREFIX}controller_size.h": _size_header(bundle), f"{PREFIX}controller_data.h": _data_header(bundle)}
+    return {named(name, bundle): named(text, bundle) for name, text in texts.items()}
+
+
+def named(text: str, bundle: Bundle) -> str:
+    """`text` with the export's name in the place of the templates'."""
+    return text.replace(PREFIX, f"{bundle.label}_").replace(PREFIX.upper(), f"{bundle.label}_".upper())
+
+
+def _with_claim(name: str, bundle: Bundle) -> str:
+    text = _template(PREFIX + name)
+    if bundle.proof.claim and name in _CLAIMS:
+        empty = _CLAIMS[name]
+        text = text.replace(empty, empty[:-1] + bundle.proof.claim + '"')
+    return text
+
+
+def _template(name: str) -> str:
     return (TEMPLATES / name).read_text(encoding="utf-8")
 
 
-def size_header(bundle: Bundle) -> str:
-    """`controller_size.h`: how many states, inputs and intervals there are, and the inputs' limits."""
+def _size_header(bundle: Bundle) -> str:
+    """How many states, inputs and intervals there are, and the inputs' limits."""
     elite = bundle.elite
     return _header(
         bundle,
@@ -34,23 +55,29 @@ def size_header(bundle: Bundle) -> str:
     )
 
 
-def data_header(bundle: Bundle) -> str:
-    """`controller_data.h`: every number that the controller and the monitor look up."""
-    elite = bundle.elite
+def _data_header(bundle: Bundle) -> str:
+    """Every number that the controller and the monitor look up."""
+    elite, begins = bundle.elite, bundle.proof.begins
     arrays = {
         "X": elite.x,
-        "X_RATES": bundle.tube.rates,
+        "X_RATES": bundle.funnel.loop.rates,
         "U": elite.u,
         "K": elite.K,
         "S": elite.S,
-        "S_RATES": bundle.tube.slopes,
+        "S_RATES": bundle.funnel.value_rates,
         "LOG_RHO": np.log(elite.rho),
         "K_GOAL": elite.K_goal,
         "X_GOAL": elite.x_goal,
         "U_MAX": elite.u_max,
         "STATE_LIMITS": elite.state_limits,
     }
-    scalars = [f"#define RTCD_DT {_number(elite.time[1])}", f"#define RTCD_DURATION {_number(elite.time[-1])}"]
+    if begins.size:
+        arrays |= {"PROOF_BEGINS": begins, "PROOF_AXES": bundle.proof.axes}
+    scalars = [
+        f"#define RTCD_DT {_number(elite.time[1])}",
+        f"#define RTCD_DURATION {_number(elite.time[-1])}",
+        f"#define RTCD_PIECES {begins.size}",
+    ]
     return _header(bundle, "RTCD_CONTROLLER_DATA_H", [*scalars, *_definitions(arrays)])
 
 
@@ -67,7 +94,7 @@ def readme(bundle: Bundle, described: dict[str, Any]) -> str:
     design = ", ".join(
         f"{name} {value:.6g} {bundle.plant.design_units[name]}" for name, value in described["design"].items()
     )
-    return Template(template("README.md")).substitute(
+    return Template(named(_template("README.md"), bundle)).substitute(
         plant=described["plant"],
         elite=bundle.name,
         config=described["config_hash"],
@@ -86,9 +113,8 @@ def readme(bundle: Bundle, described: dict[str, Any]) -> str:
 
 
 def _header(bundle: Bundle, guard: str, lines: list[str]) -> str:
-    source = (
-        f"/* {bundle.elite.plant}, elite {bundle.name}, configuration {bundle.record['config_hash']}. Generated. */"
-    )
+    elite = bundle.elite
+    source = f"/* {elite.plant}, elite {bundle.name}, configuration {elite.record['config_hash']}. Generated. */"
     return "\n".join([source, f"#ifndef {guard}", f"#define {guard}", "", *lines, "", "#endif", ""])
 
 
@@ -105,7 +131,7 @@ def _initializer(array: np.ndarray) -> str:
 
 
 def _number(value: float) -> str:
-    return repr(float(value)) if np.isfinite(value) else "HUGE_VAL"
+    return repr(float(value)) if np.isfinite(value) else "DBL_MAX"
 
 
 def _limit(limit: float) -> str:

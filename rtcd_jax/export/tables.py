@@ -1,5 +1,6 @@
 """A bundle as tables that people and toolkits read: CSV with a header row, SI units, numbers that read back exactly."""
 
+import sys
 from collections.abc import Sequence
 
 import numpy as np
@@ -10,8 +11,12 @@ VECTORS = 400
 """Rows of the test vectors."""
 LONGEST = 1.1
 """Last time of the test vectors over that of the last knot."""
-FARTHEST = 2.0
+FARTHEST = 2.5
 """Of the test vectors: so many times as far from the nominal motion as the funnel reaches."""
+ABORT = 4.0
+"""Ratio above which the exported monitors advise to abort."""
+LARGEST = sys.float_info.max
+"""The ratio of what is not finite."""
 
 
 def trajectory(bundle: Bundle) -> str:
@@ -40,25 +45,39 @@ def funnel(bundle: Bundle) -> str:
     elite, n = bundle.elite, bundle.elite.x_goal.size
     upper = np.triu_indices(n)
     names = [f"S{i + 1}{j + 1}" for i, j in zip(*upper, strict=True)]
-    header = ["time", "rho", f"volume_{bundle.record['rung']}", *names]
-    return csv(header, elite.time, elite.rho, bundle.volumes, elite.S[:, *upper])
+    header = ["time", "rho", f"volume_{elite.guarantee}", *names]
+    return csv(header, elite.time, elite.rho, elite.volumes_per_knot, elite.S[:, *upper])
 
 
 def vectors(bundle: Bundle) -> str:
-    """Times, states around the funnel, and what controller and monitor must say there: u and V/rho."""
-    elite, random = bundle.elite, np.random.default_rng(0)
-    n, m = elite.x_goal.size, elite.u_max.size
+    """Times, states around the funnel, and what controller and monitor must say there: u, ratio, inside, abort, proved.
+
+    In the last rows one entry of (t, x) is no number, or infinite.
+    """
+    random, n = np.random.default_rng(0), bundle.elite.x_goal.size
     rows = []
-    for t in np.sort(random.uniform(0, LONGEST * elite.time[-1], VECTORS)):
-        now = bundle.at(t)
+    for t in np.sort(random.uniform(0, LONGEST * bundle.elite.time[-1], VECTORS)):
         direction = random.normal(size=n)
-        reach = FARTHEST * random.uniform()
-        axes = np.sqrt(now.level) * np.linalg.inv(np.linalg.cholesky(now.value)).T
-        error = axes @ (reach * direction / np.linalg.norm(direction))
-        u = np.clip(now.u - now.gain @ error, -elite.u_max, elite.u_max)
-        rows.append([t, *(now.x + error), *u, reach**2])
-    header = ["time", *(f"x{i + 1}" for i in range(n)), *(f"u{j + 1}" for j in range(m)), "V_over_rho"]
-    return csv(header, np.array(rows))
+        y = FARTHEST * random.uniform() * direction / np.linalg.norm(direction)
+        rows.append(_vector(bundle, t, y))
+    usual = rows[0]
+    for bad in (np.nan, np.inf, -np.inf):
+        for i in range(1 + n):
+            row = usual.copy()
+            row[i] = bad
+            proved = bool(np.isfinite(row[0])) and usual[-1]
+            rows.append([*row[: 1 + n], *np.zeros_like(bundle.elite.u_max), LARGEST, False, True, proved])
+    names = [f"x{i + 1}" for i in range(n)], [f"u{j + 1}" for j in range(bundle.elite.u_max.size)]
+    return csv(["time", *names[0], *names[1], "ratio", "inside", "abort", "proved"], np.array(rows, float))
+
+
+def _vector(bundle: Bundle, t: float, y: np.ndarray) -> np.ndarray:
+    """A row of the test vectors, for the state x* + axes y."""
+    elite, now = bundle.elite, bundle.at(t)
+    error, ratio = now.axes @ y, y @ y
+    x, u = now.x + error, np.clip(now.u - now.gain @ error, -elite.u_max, elite.u_max)
+    outside = bool((np.abs(x) > elite.state_limits).any())
+    return np.array([t, *x, *u, ratio, ratio <= 1 and not outside, ratio > ABORT or outside, now.proved], float)
 
 
 def csv(header: Sequence[str], *columns: np.ndarray) -> str:

@@ -1,4 +1,4 @@
-"""Cubic Hermite interpolation."""
+"""Cubic Hermite interpolation of arrays, JAX's or numpy's."""
 
 
 def cubic_hermite(s, duration, start, start_rate, end, end_rate):
@@ -10,3 +10,9 @@ def cubic_hermite(s, duration, start, start_rate, end, end_rate):
         + (3 * s2 - 2 * s3) * end
         + (s3 - s2) * duration * end_rate
     )
+
+
+def cubic_hermite_rate(s, duration, start, start_rate, end, end_rate):
+    """The time derivative of that cubic."""
+    rest = 1 - s
+    return 6 * s * rest * (end - start) / duration + rest * (1 - 3 * s) * start_rate + s * (3 * s - 2) * end_rate

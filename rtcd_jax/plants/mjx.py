@@ -52,6 +52,17 @@ def compile_model(plant: Plant, design: eqx.Module) -> mujoco.MjModel:
     Raises:
         ValueError: the MJCF is no smooth robot of this plant's sizes, or an edit names what it lacks.
     """
+    model = edited_model(plant, design)
+    mujoco.mj_setConst(model, mujoco.MjData(model))
+    return model
+
+
+def edited_model(plant: Plant, design: eqx.Module) -> mujoco.MjModel:
+    """The compiled MJCF with nothing but the design's edits in it: what MJX computes with.
+
+    Raises:
+        ValueError: as `compile_model`.
+    """
     model = copy.copy(_host_model(type(plant)))
     with jax.enable_x64(True):
         edits = jax.tree.map(np.asarray, plant.edit_model(design))
@@ -62,7 +73,6 @@ def compile_model(plant: Plant, design: eqx.Module) -> mujoco.MjModel:
                 leaf[_row(model, attribute, name)] = row
         else:
             leaf[:] = edit
-    mujoco.mj_setConst(model, mujoco.MjData(model))
     return model
 
 

@@ -10,7 +10,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from rtcd_jax.analysis.report import report
 from rtcd_jax.config.load import Config
 from rtcd_jax.elite.records import elite_names
 from rtcd_jax.evaluation import elite_effort, make_evaluate, resample
@@ -26,12 +25,14 @@ from rtcd_jax.system.console import Console, Progress
 from rtcd_jax.system.errors import UserError
 from rtcd_jax.types import Evaluation, Status
 
-LAST_FILE = Path("report.html")
-"""Written when all else is."""
+LAST_FILE = Path("initial.json")
+"""Written when all else is: a folder that has it is complete."""
 
 
-def optimize(config: Config, folder: Path, console: Console, cluster: Cluster) -> None:
+def optimize(config: Config, folder: Path, console: Console, cluster: Cluster) -> bool:
     """Search as `config` says and leave everything in the run folder; goes on where an earlier call stopped.
+
+    Says whether anything was left to do.
 
     Raises:
         UserError: the folder belongs to something else, or nothing at all is feasible.
@@ -49,7 +50,7 @@ def optimize(config: Config, folder: Path, console: Console, cluster: Cluster) -
         whole = bool(cluster.agreed(np.asarray((folder / LAST_FILE).is_file())))
         if done == config.search.generations and whole:
             console.message(f"{folder} is complete: {done} generations, {len(elite_names(folder))} elites")
-            return
+            return False
         if done:
             console.message(f"{folder}: going on after generation {done}")
         console.message(
@@ -71,6 +72,7 @@ def optimize(config: Config, folder: Path, console: Console, cluster: Cluster) -
         found = again([*_filled(state.elites), _initial(problem, evaluate)], search.last_key(plan), last + 1, console)
         finished = search.finish(plan, state, _stacked(found[:-1], state.elites))
         cluster.on_first(lambda: _store(problem, finished, found[-1], run, console))
+        return True
 
 
 class _Clock:
@@ -164,7 +166,7 @@ def _initial(problem: Problem, evaluate: Callable[..., Spread]) -> Evaluation:
 
 
 def _store(problem: Problem, elites: Elites, initial: Evaluation, run: RunFolder, console: Console) -> None:
-    """Elites, initial candidate and figures in the run folder, a summary on the console."""
+    """Elites and initial candidate in the run folder, a summary on the console."""
     best_first = _filled(elites)
     if not best_first:
         raise UserError(
@@ -172,23 +174,12 @@ def _store(problem: Problem, elites: Elites, initial: Evaluation, run: RunFolder
             "so that the search is not misled by luck"
         )
     effort = elite_effort(problem)
-    run.write_initial(arrays_of(problem, initial), record_of(problem, effort, initial))
     run.write_elites((arrays_of(problem, found), record_of(problem, effort, found)) for found in best_first)
     run.tell_time()
+    run.write_initial(arrays_of(problem, initial), record_of(problem, effort, initial))
     for line in _summary(problem, initial, best_first[0]):
         console.message(line)
     console.message(f"{len(best_first)} elites in {run.path}")
-    _report(run.path, console)
-
-
-def _report(folder: Path, console: Console) -> None:
-    """The run's page and figures. The run is whole without them: what goes wrong here is told, and ends nothing."""
-    try:
-        page, *figures = report([folder])
-    except Exception as error:
-        console.message(f"the run is finished, but its report failed: {error!r}; `rtcd report {folder}` makes it")
-    else:
-        console.message(f"{page}, and {len(figures)} figures in {figures[0].parent}")
 
 
 def _row(evaluation: Evaluation, index: int) -> Evaluation:

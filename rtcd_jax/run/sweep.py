@@ -15,6 +15,7 @@ import copy
 import csv
 import io
 import itertools
+import math
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -31,6 +32,7 @@ from rtcd_jax.system.files import make_folder, read_json, reading, replace
 
 TABLE = "table.csv"
 WAYS = ("product", "zip")
+MOST_CASES = 10_000
 VOLUMES = ("sum", "integral", "inlet", "geometric_mean")
 
 
@@ -82,6 +84,10 @@ def _problems(section: Any) -> Iterator[Problem]:
     lengths = {key: len(values) for key, values in _of(section, "zip").items() if isinstance(values, list)}
     if len(set(lengths.values())) > 1:
         yield Problem(("sweep", "zip"), "all lists must be of one length", lengths)
+    cases = math.prod(len(values) for values in _of(section, "product").values() if isinstance(values, list))
+    cases *= max(lengths.values(), default=1)
+    if cases > MOST_CASES:
+        yield Problem(("sweep",), f"makes {cases} runs, must make {MOST_CASES} at most")
     twice = _of(section, "product").keys() & _of(section, "zip").keys()
     if twice:
         yield Problem(("sweep",), "a key stands in product or in zip, not in both", sorted(twice))
@@ -147,8 +153,7 @@ def show(cases: Sequence[Case], folder: Path) -> str:
 
 
 def _row(case: Case) -> dict[str, Any]:
-    volumes = {name: _volumes(case.folder, name) for name in ("initial", "elites/000")}
-    initial, best = volumes.values()
+    initial, best = (_volumes(case.folder, name) for name in ("initial", "000"))
     objective = case.config.search.objective
     ratio = best[objective] / initial[objective] if best and initial and initial[objective] > 0 else None
     return {
@@ -169,7 +174,9 @@ def _generations(folder: Path) -> int:
 
 
 def _volumes(folder: Path, name: str) -> dict[str, float]:
-    record = folder / f"{name}.json"
+    from rtcd_jax.elite.records import elite_folder
+
+    record = elite_folder(folder, name) / f"{name}.json"
     advice = "restore it, or make the run again"
     with reading(record, advice):
         return read_json(record, advice)["volumes"] if record.is_file() else {}

@@ -7,6 +7,8 @@ from typing import Any, NamedTuple
 NO_VALUE = object()
 """Stands for a value where there is none to show."""
 _LONGEST_VALUE = 60
+_LONGEST_KEY = 120
+_MOST_PROBLEMS = 20
 
 
 class Problem(NamedTuple):
@@ -17,13 +19,10 @@ class Problem(NamedTuple):
     value: Any = NO_VALUE
 
     def __str__(self) -> str:
-        key = ".".join(map(str, self.path)) or "the configuration"
+        key = printable(".".join(map(str, self.path)), _LONGEST_KEY) or "the configuration"
         if self.value is NO_VALUE:
             return f"{key}: {self.text}"
-        shown = repr(self.value)
-        if len(shown) > _LONGEST_VALUE:
-            shown = shown[: _LONGEST_VALUE - 1] + "…"
-        return f"{key} = {shown}: {self.text}"
+        return f"{key} = {printable(repr(self.value), _LONGEST_VALUE)}: {self.text}"
 
 
 class UserError(ValueError):
@@ -31,13 +30,18 @@ class UserError(ValueError):
 
 
 class ConfigError(UserError):
-    """Everything that is wrong with a configuration, at once: a line, or one each under a heading."""
+    """Everything that is wrong with a configuration, at once: a line, or one each under a heading, twenty at most."""
 
     def __init__(self, problems: Iterable[Problem], source: str = "configuration"):
         self.problems = tuple(problems)
         self.source = source
         first, *others = self.problems
-        told = [f"{source}: {len(self.problems)} errors", *(f"  {problem}" for problem in self.problems)]
+        told = [
+            f"{source}: {len(self.problems)} errors",
+            *(f"  {problem}" for problem in self.problems[:_MOST_PROBLEMS]),
+        ]
+        if len(self.problems) > _MOST_PROBLEMS:
+            told.append(f"  and {len(self.problems) - _MOST_PROBLEMS} more")
         if not others:
             told = [f"{source}: {first if first.path or first.value is not NO_VALUE else first.text}"]
         super().__init__("\n".join(told))
@@ -49,3 +53,15 @@ def closest(word: object, known: Sequence[str]) -> str:
     for match in difflib.get_close_matches(str(word).lower(), known, n=1):
         return f"did you mean {match!r}? Valid: {listed}"
     return f"valid: {listed}"
+
+
+def printable(text: object, longest: int | None = None) -> str:
+    """Text from outside (a file's keys, names, notes) on one line that a terminal only shows: never obeys, never hides.
+
+    Escape codes, line breaks, marks that turn the direction of writing and half characters become Python's escapes;
+    everything else stays. What is longer than `longest` characters ends in "…".
+    """
+    shown = "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in str(text)[:longest])
+    if longest is not None and len(shown) + (len(str(text)) > longest) > longest:
+        shown = shown[: longest - 1] + "…"
+    return shown

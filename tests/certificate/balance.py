@@ -4,6 +4,8 @@ import numpy as np
 from scipy.integrate import solve_ivp
 from scipy.linalg import solve_continuous_are
 
+from tests.certificate.swing import PROMISE
+
 PARAMETERS = {
     "Mc": 1.0731266, "Mp": 0.227, "lp": 0.1778, "inertia_about_com": 0.00239204, "Beq": 5.4, "Bp": 0.0024, "g": 9.81,
     "force_limit": 6.0,
@@ -51,7 +53,7 @@ def elite(forces=(5.9, 1.0)):
         "u_max": np.array([6.0]),
     }  # fmt: skip
     arrays["volumes_per_knot"] = np.pi**2 / 2 * arrays["rho"] ** 2 / np.sqrt(np.linalg.det(arrays["S"]))
-    return arrays, {"plant": "cartpole", "parameters": PARAMETERS, "state_limits": [0.3, None, None, None]}
+    return arrays, {"plant": "cartpole", "parameters": PARAMETERS, "state_limits": [0.3, None, None, None], **PROMISE}
 
 
 def _backward(z, force):

@@ -8,6 +8,7 @@ PARAMETERS = {"m": 0.6, "l": 0.4, "b": 0.1, "g": 9.81, "torque_limit": 2.5}
 UPRIGHT = np.array([np.pi, 0.0])
 Q, R = np.diag([4.0, 8.0]), np.array([[10.0]])
 DT = 0.05
+PROMISE = {"rung": "sampled", "epsilon": 0.01, "confidence": 0.99}
 
 
 def rate(x, u, p=PARAMETERS):
@@ -40,7 +41,7 @@ def elite(torques=(1.2, 1.0, 0.7, 0.4)):
     }  # fmt: skip
     determinants = np.linalg.det(arrays["S"])
     arrays["volumes_per_knot"] = np.pi * arrays["rho"] / np.sqrt(determinants)
-    return arrays, {"plant": "pendulum", "parameters": PARAMETERS, "state_limits": [6.283185307179586, 7.0]}
+    return arrays, {"plant": "pendulum", "parameters": PARAMETERS, "state_limits": [6.283185307179586, 7.0], **PROMISE}
 
 
 def _backward(z, torque):

@@ -11,6 +11,7 @@ from rtcd_jax.certificate.prove import certify as elite
 from rtcd_jax.certificate.prove.closed_loop import Loop, claim_of, double, sealed
 from rtcd_jax.certificate.prove.run import certify_run, rank_correlation
 from rtcd_jax.cli import main as cli
+from rtcd_jax.elite.elite import Elite
 from rtcd_jax.system.errors import UserError
 from tests.certificate import swing
 from tests.certificate.folder import folder_with
@@ -32,8 +33,8 @@ def folder_of(path, **changed):
     return folder_with(path, {**arrays, **changed}, record)
 
 
-def claimed(arrays, record):
-    told = {**claim_of(arrays, record), "start": [0, double(0.0)]}
+def claimed(elite):
+    told = {**claim_of(elite), "start": [0, double(0.0)]}
     return check.read_claim(check.Node("claim", sealed(told)))
 
 
@@ -53,8 +54,8 @@ def test_the_claim_is_the_elite_bit_by_bit(content):
 
 def test_its_shape_is_the_riccati_equation_s():
     """Between knots S follows the equation that the elite's S solves, and L its rate."""
-    arrays, record = swing.elite()
-    loop = Loop(claimed(arrays, record), arrays)
+    elite = Elite.of(*swing.elite())
+    loop = Loop(claimed(elite), elite)
     finer, _ = swing.elite(tuple(np.repeat([1.2, 1.0, 0.7, 0.4], 1)))
     np.testing.assert_allclose(loop.value(1, 0.0)[0], finer["S"][1])
     step = 1e-5
@@ -77,9 +78,9 @@ def test_levels_are_as_large_as_the_loop_allows(content):
 
 
 def steps_of(stored):
-    arrays, record = stored
-    claim = claimed(arrays, record)
-    search = descent.Descent(claim, Loop(claim, arrays), exact=False)
+    elite = Elite.of(*stored)
+    claim = claimed(elite)
+    search = descent.Descent(claim, Loop(claim, elite), exact=False)
     return list(search.down_from(search.outlet(15.0)))
 
 
@@ -150,11 +151,13 @@ def test_another_elite_s_journal_is_not_used(tmp_path):
 def test_what_cannot_be_claimed_is_refused():
     arrays, record = swing.elite()
     with pytest.raises(UserError, match="the checker knows pendulum, cartpole"):
-        claim_of(arrays, {**record, "plant": "acrobot"})
+        claim_of(Elite.of(arrays, {**record, "plant": "acrobot"}))
     with pytest.raises(UserError, match=r"u_max = 9\.0: must be torque_limit = 2\.5"):
-        claim_of({**arrays, "u_max": np.array([9.0])}, record)
+        claim_of(Elite.of({**arrays, "u_max": np.array([9.0])}, record))
+    gains = {"K": np.zeros((5, 2, 2)), "K_goal": np.eye(2)}
+    two = Elite.of({**arrays, **gains, "u": np.zeros((4, 2)), "u_max": np.ones(2), "R": np.eye(2)}, record)
     with pytest.raises(UserError, match="no certificate for 2 inputs"):
-        claim_of({**arrays, "u": np.zeros((4, 2))}, record)
+        claim_of(two)
 
 
 def test_the_command_line(run, tmp_path, capsys):

@@ -7,6 +7,7 @@ from scipy.linalg import expm, solve_continuous_are
 from rtcd_jax.certificate import check
 from rtcd_jax.certificate.prove.closed_loop import Loop, claim_of, double, sealed
 from rtcd_jax.certificate.prove.goal import goal_region
+from rtcd_jax.elite.elite import Elite
 from tests.certificate import swing
 from tests.certificate.loops import Simulated
 
@@ -28,11 +29,13 @@ class Upright:
         arrays = {
             "time": np.array([0, 0.05]), "x": np.array([swing.UPRIGHT] * 2), "u": np.zeros((1, 1)),
             "K": np.array([self.K] * 2), "S": np.array([self.S] * 2), "Q": np.diag(q), "R": np.array([[r]]),
-            "K_goal": self.K, "x_goal": swing.UPRIGHT, "u_max": np.array([self.limit]),
+            "K_goal": self.K, "x_goal": swing.UPRIGHT, "u_max": np.array([self.limit]), "rho": np.ones(2),
+            "volumes_per_knot": np.ones(2),
         }  # fmt: skip
-        told = claim_of(arrays, {"plant": "pendulum", "parameters": parameters, "state_limits": [None, None]})
-        claim = check.read_claim(check.Node("claim", sealed({**told, "start": [0, double(0.0)]})))
-        self.claim, self.loop = claim, Loop(claim, arrays)
+        told = {"plant": "pendulum", "parameters": parameters, "state_limits": [None, None], **swing.PROMISE}
+        elite = Elite.of(arrays, told)
+        claim = check.read_claim(check.Node("claim", sealed({**claim_of(elite), "start": [0, double(0.0)]})))
+        self.claim, self.loop = claim, Loop(claim, elite)
         region = goal_region(claim, self.loop, exact=True)
         assert region is not None
         self.rho = region.rho

@@ -9,6 +9,7 @@ from rtcd_jax.certificate.prove import certify as elite
 from rtcd_jax.certificate.prove.closed_loop import Loop
 from rtcd_jax.certificate.prove.goal import goal_region
 from rtcd_jax.certificate.prove.levels import SHARES, SPARED, directions, goal_level, leveled, merit
+from rtcd_jax.elite.elite import Elite
 from tests.certificate import swing
 from tests.certificate.folder import folder_with
 from tests.certificate.test_certify import claimed
@@ -19,8 +20,8 @@ AIMS = directions(2)
 
 def loop_of(arrays=None, **record):
     stored, told = swing.elite()
-    arrays = {**stored, **(arrays or {})}
-    return Loop(claimed(arrays, {**told, **record}), arrays)
+    elite = Elite.of({**stored, **(arrays or {})}, {**told, **record})
+    return Loop(claimed(elite), elite)
 
 
 @pytest.fixture(scope="module")

@@ -46,10 +46,10 @@ def test_numbers_have_units_and_names_have_their_choices():
         assert meaning
     told = rows()
     assert told["search.objective"][2] == r"sum, integral, inlet, geometric\_mean"
-    assert told["search.population"][:3] == ["-", "128", ">= 4"]
-    assert told["policy.authority"][:3] == ["-", "1.0", "> 0 and <= 1"]
+    assert told["search.population"][:3] == ["-", "128", ">= 4 and <= 1048576"]
+    assert told["policy.authority"][:3] == ["-", "1.0", ">= 1e-06 and <= 1"]
     assert "or a variable" in told["policy.authority"][3]
-    assert told["plant.torque_limit"] == ["N m", "2.5", "> 0", r"largest \|torque\| of the motor"]
+    assert told["plant.torque_limit"] == ["N m", "2.5", ">= 1e-06 and <= 1e+06", r"largest \|torque\| of the motor"]
 
 
 def test_every_robot_has_its_tables():

@@ -12,6 +12,7 @@ import pytest
 from rtcd_jax.cli import main as cli
 from rtcd_jax.config.load import Config, load, resolved
 from rtcd_jax.system.devices import cores
+from tests.paths import ROOT
 
 RTCD = str(ROOT / "configs" / "pendulum_rtcd.yaml")
 
@@ -83,7 +84,7 @@ def test_help_of_optimize_names_every_key_with_unit_and_default(arguments):
             continue
         assert "(default: " in options[key], key
         assert re.search(r"\[.+\]", options[key]) or "{" in options[key], key
-    assert "[kg] (default: 0.7)" in options["design.mass.initial"]
+    assert "[kg] (>= -1e+09 and <= 1e+09) (default: 0.7)" in options["design.mass.initial"]
     assert "[1/(s (N m)^2)] (default: 0.001)" in options["weights.r.0.min"]
     assert "hold the initial value" in text
 
@@ -104,7 +105,7 @@ WRONG = {
     "wrong type": (["optimize", RTCD, "--search.population", "x"], "Error parsing --search.population"),
     "wrong name": (["optimize", RTCD, "--search.objective", "inlets"], "invalid choice 'inlets'"),
     "out of range": (["optimize", RTCD, "--search.population", "3"], "search.population = 3: must be >= 4"),
-    "start outside": (["optimize", RTCD, "--task.start", "7", "0"], "task.start.0 = 7.0: must lie in"),
+    "start outside": (["optimize", RTCD, "--task.start", "7", "0"], "task.start.0 = 7.0: must lie between"),
     "too few": (["optimize", RTCD, "--task.start", "1"], "task.start: must have 2 entries (theta, theta_dot), has 1"),
     "no run": (["verify", "no/such/run"], "no/such/run: no such run folder"),
     "no states": (["verify", "configs", "--states", "0"], "--states = 0: must be >= 1"),
@@ -164,9 +165,10 @@ def run_module(monkeypatch):
     """Stands in for the run: records what the command line hands over."""
     calls = []
     module = types.ModuleType("rtcd_jax.run.optimize")
-    module.optimize = lambda config, folder, console, cluster: calls.append((config, folder))
+    module.optimize = lambda config, folder, console, cluster: calls.append((config, folder)) or True
     monkeypatch.setitem(sys.modules, "rtcd_jax.run.optimize", module)
     monkeypatch.setattr(cli, "prepare_jax", lambda *_: None)
+    monkeypatch.setattr("rtcd_jax.analysis.report.report", lambda folders: (folders[0] / "report.html",) * 2)
     monkeypatch.setattr("rtcd_jax.system.cluster.Cluster.heed", lambda cluster: None)  # signals stay pytest's
     module.calls = calls
     return module
@@ -226,18 +228,18 @@ def test_a_bug_is_no_user_error(run_module):
 @pytest.mark.parametrize(("held", "code"), [(True, 0), (False, 1)])
 def test_verify_exits_by_the_promise(monkeypatch, tmp_path, held, code):
     calls = []
-    module = types.ModuleType("rtcd_jax.analysis.verify")
+    module = types.ModuleType("rtcd_jax.analysis.verify.run")
     module.verify_run = lambda folder, states, seed, workers, console: calls.append((folder, states, seed)) or held
-    monkeypatch.setitem(sys.modules, "rtcd_jax.analysis.verify", module)
+    monkeypatch.setitem(sys.modules, "rtcd_jax.analysis.verify.run", module)
     monkeypatch.setattr(cli, "prepare_jax", lambda *_: None)
     assert cli.main(["verify", str(tmp_path), "--states", "10", "--seed", "3"]) == code
     assert calls == [(tmp_path, 10, 3)]
 
 
 def test_a_page_that_cannot_be_brought_up_to_date_ends_nothing(monkeypatch, tmp_path, capsys):
-    module = types.ModuleType("rtcd_jax.analysis.verify")
+    module = types.ModuleType("rtcd_jax.analysis.verify.run")
     module.verify_run = lambda *_: True
-    monkeypatch.setitem(sys.modules, "rtcd_jax.analysis.verify", module)
+    monkeypatch.setitem(sys.modules, "rtcd_jax.analysis.verify.run", module)
     monkeypatch.setattr(cli, "prepare_jax", lambda *_: None)
     assert cli.main(["verify", str(tmp_path)]) == 0
     assert capsys.readouterr().out == ""
@@ -249,11 +251,24 @@ def test_a_page_that_cannot_be_brought_up_to_date_ends_nothing(monkeypatch, tmp_
     )
 
 
+def test_a_failing_report_ends_nothing(run_module, tmp_path, monkeypatch, capsys):
+    """The run is finished; what went wrong is told, with the command that tries again."""
+
+    def broken(_):
+        raise RuntimeError("no fonts")
+
+    monkeypatch.setattr("rtcd_jax.analysis.report.report", broken)
+    assert cli.main(["optimize", RTCD, "--run", str(tmp_path)]) == 0
+    assert capsys.readouterr().out == (
+        f"the run is finished, but its report failed: RuntimeError('no fonts'); `rtcd report {tmp_path}` makes it\n"
+    )
+
+
 @pytest.mark.parametrize(("kept", "code"), [(True, 0), (False, 1)])
 def test_replay_exits_by_the_funnel(monkeypatch, tmp_path, kept, code):
     calls = []
     module = types.ModuleType("rtcd_jax.analysis.replay.replay")
-    module.replay_run = lambda folder, file, elite, console: calls.append((folder, file, elite)) or kept
+    module.replay_run = lambda folder, file, elite, *_: calls.append((folder, file, elite)) or kept
     monkeypatch.setitem(sys.modules, "rtcd_jax.analysis.replay.replay", module)
     for elite in ("2", "initial"):
         assert cli.main(["replay", str(tmp_path), "lab.csv", "--elite", elite]) == code
@@ -296,7 +311,7 @@ def test_export_hands_on_the_elite_and_the_folder(monkeypatch, tmp_path):
 
 
 def test_disturb_hands_on_states_and_seed(monkeypatch, tmp_path):
-    calls = _standing_in(monkeypatch, "disturb", "disturb_run")
+    calls = _standing_in(monkeypatch, "analysis.disturb", "disturb_run")
     assert cli.main(["disturb", str(tmp_path)]) == 0
     assert cli.main(["disturb", str(tmp_path), "--states", "10", "--seed", "3"]) == 0
     assert calls == [(tmp_path, 1000, 0), (tmp_path, 10, 3)]
@@ -306,7 +321,6 @@ PREPARED = """
 from rtcd_jax.system.devices import prepare_jax
 prepare_jax()
 import jax
-from tests.paths import ROOT
 print(jax.device_count(), jax.numpy.zeros(1).dtype)
 """
 

@@ -20,10 +20,17 @@ from rtcd_jax.config.load import (
     resolved,
 )
 from rtcd_jax.config.schema import PLANTS, Variable
+from rtcd_jax.config.settings import Settings, bounds
 from rtcd_jax.system.errors import ConfigError
 from tests.paths import CONFIGS
 
 REMOVED = object()
+
+
+def sections():
+    """The models of all sections but the design, by name."""
+    fields = ((name, field.annotation) for name, field in Config.model_fields.items())
+    return [(name, kind) for name, kind in fields if isinstance(kind, type) and issubclass(kind, Settings)]
 
 
 def changed(changes):
@@ -85,11 +92,25 @@ REFUSED = {
     "number for a variable": ({"weights.q.0": 1}, "weights.q.0 = 1: must be a mapping with the keys initial, min, max"),
     "not a number": ({"plant.gravity": math.nan}, "plant.gravity = nan: must be"),
     "infinite": ({"design.mass.max": math.inf}, "design.mass.max = inf: must be finite"),
-    "limit is not a number": ({"task.state_limits.0": math.nan}, "task.state_limits.0 = nan: must be > 0"),
+    "limit is not a number": ({"task.state_limits.0": math.nan}, "task.state_limits.0 = nan: must be >= 1e-06"),
     "crossed box": ({"design.mass.min": 0.9}, "design.mass.min = 0.9: must be <= max = 0.8"),
-    "crossed step": ({"trajectory.step.min": 0.1}, "trajectory.step.min = 0.1: must be < max = 0.1"),
-    "start outside": ({"task.start.1": 7.5}, "task.start.1 = 7.5: must lie in [-7, 7] (task.state_limits)"),
-    "goal outside": ({"task.goal.0": -6.5}, "task.goal.0 = -6.5: must lie in [-6.28319, 6.28319]"),
+    "crossed step": ({"trajectory.step.min": 0.2}, "trajectory.step.min = 0.2: must be <= max = 0.1; equal ones fix"),
+    "start outside": ({"task.start.1": 7.5}, "task.start.1 = 7.5: must lie between -7 and 7 (task.state_limits)"),
+    "goal outside": ({"task.goal.0": -6.5}, "task.goal.0 = -6.5: must lie between -6.28319 and 6.28319"),
+    "goal on a limit": (
+        {"task.state_limits.0": math.pi},
+        "task.goal.0 = 3.141592653589793: must lie between -3.14159 and 3.14159 (task.state_limits): on a limit there",
+    ),
+    "start beyond the motion's share": (
+        {"task.start.1": 6.5, "trajectory.limit_share": 0.9},
+        "task.start.1 = 6.5: must lie in [-6.3, 6.3] (trajectory.limit_share of the limit)",
+    ),
+    "endless rollouts": (
+        {"funnel.goal": {"horizon": 1000, "step": 1e-6}},
+        "funnel.goal.step = 1e-06: must be >= horizon / 100000 = 0.01",
+    ),
+    "huge limit": ({"task.state_limits.0": 1e308}, "task.state_limits.0 = 1e+308: must be <= 1e+06, or .inf for none"),
+    "huge start": ({"task.start.0": 1e7}, "task.start.0 = 10000000.0: must be >= -1e+06 and <= 1e+06; first state"),
     "no motion": ({"task.goal": [0, 0]}, "task.goal = (0.0, 0.0): must differ from task.start"),
     "short start": ({"task.start": [0]}, "task.start: must have 2 entries (theta, theta_dot), has 1"),
     "long goal": ({"task.goal": [3, 0, 0]}, "task.goal: must have 2 entries (theta, theta_dot), has 3"),
@@ -101,7 +122,7 @@ REFUSED = {
         {"design.lenght": VARIABLE},
         "design.lenght: unknown design field of pendulum; did you mean 'length'? Valid: mass, length",
     ),
-    "zero design": ({"design.mass.min": 0}, "design.mass.min = 0.0: must be > 0: masses and lengths are positive"),
+    "zero design": ({"design.mass.min": 0}, "design.mass.min = 0.0: must be >= 1e-06: masses and lengths are positive"),
     "text for an option": (
         {"policy.authority": "x"},
         "policy.authority = 'x': must be a number, or a mapping with the",
@@ -112,7 +133,7 @@ REFUSED = {
         {"policy.authority": {"initial": 0.5, "min": 0.5, "max": 0.1}},
         "policy.authority.min = 0.5: must be <= max = 0.1",
     ),
-    "zero weight": ({"weights.q.0.min": 0}, "weights.q.0.min = 0.0: must be > 0: weights have a log scale"),
+    "zero weight": ({"weights.q.0.min": 0}, "weights.q.0.min = 0.0: must be >= 1e-09: weights have a log scale"),
     "mixed without a share": (
         {"funnel.mjx_share": 0},
         "funnel.mjx_share = 0.0: must be > 0 when rollouts = 'mixed', or choose 'closed_form'",
@@ -139,62 +160,110 @@ def test_refused_in_these_words(case):
 # Dotted key, an accepted value at the end of its range, a refused one beyond it.
 ENDS = [
     ("plant.damping", 0, -1e-9),
-    ("plant.gravity", 1e-9, 0),
-    ("plant.torque_limit", 1e-9, 0),
-    ("task.state_limits.1", 1e-9, 0),
-    ("task.start.1", 7, math.nextafter(7, 8)),
-    ("task.start.1", -7, math.nextafter(-7, -8)),
+    ("plant.damping", 1e6, 1.1e6),
+    ("plant.gravity", 1e-6, 0),
+    ("plant.gravity", 1e6, 1e308),
+    ("plant.torque_limit", 1e-6, 5e-324),
+    ("plant.torque_limit", 1e6, 1.1e6),
+    ("task.state_limits.1", 1e-6, 1e-7),
+    ("task.state_limits.1", 1e6, 1.1e6),
+    ("task.start.1", math.nextafter(7, 0), 7),
+    ("task.start.1", math.nextafter(-7, 0), -7),
     ("design.mass.initial", 0.6, math.nextafter(0.6, 0)),
     ("design.mass.initial", 0.8, math.nextafter(0.8, 1)),
-    ("design.mass.min", 1e-9, 0),
-    ("weights.r.0.min", 1e-9, 0),
+    ("design.mass.min", 1e-6, 5e-324),
+    ("design.mass.max", 1e9, 1e308),
+    ("weights.r.0.min", 1e-9, 5e-324),
+    ("weights.r.0.max", 1e9, 1.7e308),
     ("trajectory.knots", 3, 2),
-    ("trajectory.step.min", 1e-9, 0),
-    ("trajectory.step.min", math.nextafter(0.1, 0), 0.1),
+    ("trajectory.knots", 10_000, 10_001),
+    ("trajectory.step.min", 1e-6, 1e-7),
+    ("trajectory.step.min", 0.1, math.nextafter(0.1, 1)),
+    ("trajectory.step.max", 1000, 1e308),
     ("trajectory.time_weight", 0, -1e-9),
+    ("trajectory.time_weight", 1e6, 1e308),
     ("trajectory.substeps", 1, 0),
+    ("trajectory.substeps", 1000, 10**19),
     ("trajectory.max_iterations", 1, 0),
+    ("trajectory.max_iterations", 100_000, 100_001),
     ("trajectory.starts", 1, 0),
     ("trajectory.starts", 2, 3),
+    ("trajectory.limit_share", 0.6, 5e-324),
+    ("trajectory.limit_share", 1, 1.01),
     ("funnel.mjx_share", 1, 1.001),
     ("funnel.mjx_share", 1e-9, 0),
     ("funnel.directions", 1, 0),
+    ("funnel.directions", 100_000, 10**19),
     ("funnel.climbers", 2, 1),
+    ("funnel.climbers", 10_000, 10_001),
     ("funnel.climbs", 0, -1),
-    ("trajectory.limit_share", 1, 1.01),
+    ("funnel.climbs", 1000, 1001),
     ("funnel.steps", 1, 0),
+    ("funnel.steps", 1000, 1001),
     ("funnel.trials", 1, 0),
+    ("funnel.trials", 1_000_000, 10**19),
     ("funnel.confidence", 1e-9, 0),
     ("funnel.confidence", 0.999999, 1),
     ("funnel.goal.directions", 1, 0),
+    ("funnel.goal.directions", 100_000, 100_001),
     ("funnel.goal.radii", 3, 2),
+    ("funnel.goal.radii", 1000, 1001),
     ("funnel.goal.rounds", 1, 0),
+    ("funnel.goal.rounds", 20, 21),
     ("funnel.goal.horizon", 0.03, 0.02),
-    ("funnel.goal.step", 1e-9, 0),
+    ("funnel.goal.horizon", 1000, 1e308),
+    ("funnel.goal.step", 2.1e-5, 1.9e-5),
     ("search.population", 4, 3),
+    ("search.population", 2**20, 10**19),
     ("search.generations", 1, 0),
-    ("search.sigma", 1e-9, 0),
+    ("search.generations", 1_000_000, 1_000_001),
+    ("search.sigma", 1e-6, 5e-324),
     ("search.sigma", 1, 1.001),
     ("search.seed", 0, -1),
     ("search.seed", 2**32 - 1, 2**32),
     ("search.chunk", 1, 0),
+    ("search.chunk", 2**20, 2**20 + 1),
     ("search.nested.designs", 4, 3),
+    ("search.nested.designs", 2**20, 2**20 + 1),
     ("search.nested.generations", 1, 0),
+    ("search.nested.generations", 1_000_000, 1_000_001),
     ("elites.count", 1, 0),
+    ("elites.count", 10_000, 10_001),
     ("elites.distance", 0, -1e-9),
     ("elites.distance", 0.999, 1),
     ("elites.trials", 1, 0),
+    ("elites.trials", 10**8, 10**19),
     ("elites.directions", 1, 0),
+    ("elites.directions", 1_000_000, 1_000_001),
     ("checkpoint.seconds", 0, -1e-9),
+    ("checkpoint.seconds", 1e6, 1e308),
     ("policy.input_weight", 1e-9, 0),
+    ("policy.input_weight", 1e9, 1e308),
+    ("policy.input_weight", {"initial": 1, "min": 1e-9, "max": 1}, {"initial": 1, "min": 0, "max": 1}),
     ("policy.authority", 1, 1.001),
-    ("policy.authority", 1e-9, 0),
-    ("policy.authority", {"initial": 1, "min": 1e-9, "max": 1}, {"initial": 1, "min": 0, "max": 1}),
+    ("policy.authority", 1e-6, 0),
+    ("policy.authority", {"initial": 1, "min": 1e-6, "max": 1}, {"initial": 1, "min": 0, "max": 1}),
     ("policy.authority", {"initial": 1, "min": 0.1, "max": 1}, {"initial": 1, "min": 0.1, "max": 1.001}),
     ("policy.discount", 0, -1e-9),
-    ("policy.discount", 9, math.inf),
+    ("policy.discount", 1000, math.inf),
+    ("policy.discount", 1000, math.nan),
     ("policy.discount", {"initial": 0, "min": 0, "max": 1}, {"initial": 0, "min": -1, "max": 1}),
 ]
+
+
+def numbers(model, prefix=""):
+    """The dotted keys of all numbers below a section."""
+    for name, field in model.model_fields.items():
+        if isinstance(field.annotation, type) and issubclass(field.annotation, Settings):
+            yield from numbers(field.annotation, f"{prefix}{name}.")
+        elif field.annotation in (int, float):
+            yield f"{prefix}{name}", field
+
+
+@pytest.mark.parametrize("model", [*(model for name, model in sections() if name != "plant"), *PLANTS.values()])
+def test_every_number_has_both_ends(model):
+    ends = {key: bounds(field) for key, field in numbers(model)}
+    assert [key for key, limits in ends.items() if not (">" in limits and "<" in limits)] == []
 
 
 @pytest.mark.parametrize(("key", "inside", "outside"), ENDS)
@@ -273,7 +342,7 @@ def test_no_mapping_at_all():
         ("plant: {", "no valid YAML: line 1, column 9: expected the node content"),
         ("plant: 1\nplant: 2", "no valid YAML: line 2, column 1: the key 'plant' is given twice"),
         ("plant: \x00", "no valid YAML: unacceptable character"),
-        ("[1]: 2\n[1]: 2", "no valid YAML: line 1, column 1: found unhashable key"),
+        ("[1]: 2\n[1]: 2", "no valid YAML: line 1, column 1: a key must be a text"),
     ],
 )
 def test_no_yaml(text, words):

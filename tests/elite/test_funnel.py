@@ -4,15 +4,19 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from rtcd_jax.elite.funnel import Tube, dynamics_of, linearized
-from rtcd_jax.elite.simulators import CLOSED_FORMS
-from rtcd_jax.system.errors import UserError
+from rtcd_jax.elite.elite import Elite
+from rtcd_jax.elite.funnel import FunnelInterpolant, linearized
+from rtcd_jax.elite.simulators import CLOSED_FORMS, dynamics_of
 from tests.analysis.report.loops import LOOPS, stored
 from tests.certificate import balance, swing
 
 
 def linear(plant, x, u):
     return swing.linear(x) if plant == "pendulum" else balance.linear(x, u)
+
+
+def interpolant(arrays, record):
+    return FunnelInterpolant.of(Elite.of(arrays, record))
 
 
 def between(plant, arrays, k, share, policy=None):
@@ -38,58 +42,58 @@ def between(plant, arrays, k, share, policy=None):
 @pytest.mark.parametrize("share", [0.25, 0.5, 0.75])
 def test_between_knots_the_nominal_and_s_solve_their_equations(plant, share):
     arrays, record = stored(plant)
-    tube = Tube.of(arrays, record)
+    funnel = interpolant(arrays, record)
     for k in range(len(arrays["u"])):
         time = np.array([(k + share) * LOOPS[plant].DT])
         x, S = between(plant, arrays, k, share)
-        np.testing.assert_allclose(tube.nominal(time)[0], x, atol=5e-5)
-        np.testing.assert_allclose(tube.value(time)[0], S, rtol=2e-3, atol=2e-3 * np.abs(np.diag(S)).min())
+        np.testing.assert_allclose(funnel.nominal(time)[0], x, atol=5e-5)
+        np.testing.assert_allclose(funnel.value(time)[0], S, rtol=2e-3, atol=2e-3 * np.abs(np.diag(S)).min())
 
 
 @pytest.mark.parametrize("policy", [{"discount": 1.5}, {"input_weight": 0.5, "authority": 0.3}])
 def test_the_slopes_of_s_are_those_of_the_run_s_own_policy(policy):
     arrays, record = stored("pendulum")
-    with_policy, without = Tube.of(arrays, record | {"policy": policy}), Tube.of(arrays, record)
+    with_policy, without = interpolant(arrays, record | {"policy": policy}), interpolant(arrays, record)
     step = 1e-5
     for k in range(len(arrays["u"])):
         _, before = between("pendulum", arrays, k, 1 - step, policy)
         slope = (arrays["S"][k + 1] - before) / (step * swing.DT)
-        np.testing.assert_allclose(with_policy.slopes[k, 1], slope, rtol=1e-4, atol=1e-3)
-        assert not np.allclose(without.slopes[k, 1], slope, rtol=1e-2)
+        np.testing.assert_allclose(with_policy.value_rates[k, 1], slope, rtol=1e-4, atol=1e-3)
+        assert not np.allclose(without.value_rates[k, 1], slope, rtol=1e-2)
 
 
 @pytest.mark.parametrize("plant", LOOPS)
 def test_at_the_knots_it_is_the_stored_funnel_and_after_the_last_the_goal_s(plant):
     arrays, record = stored(plant)
     arrays["rho"] = np.geomspace(0.5, 2, len(arrays["rho"]))
-    tube = Tube.of(arrays, record)
-    np.testing.assert_allclose(tube.nominal(arrays["time"]), arrays["x"], atol=1e-12)
-    np.testing.assert_allclose(tube.value(arrays["time"]), arrays["S"], rtol=1e-12)
-    np.testing.assert_allclose(tube.level(arrays["time"]), arrays["rho"])
+    funnel = interpolant(arrays, record)
+    np.testing.assert_allclose(funnel.nominal(arrays["time"]), arrays["x"], atol=1e-12)
+    np.testing.assert_allclose(funnel.value(arrays["time"]), arrays["S"], rtol=1e-12)
+    np.testing.assert_allclose(funnel.level(arrays["time"]), arrays["rho"])
     middle = (arrays["time"][:-1] + arrays["time"][1:]) / 2
-    np.testing.assert_allclose(tube.level(middle), np.sqrt(arrays["rho"][:-1] * arrays["rho"][1:]))
+    np.testing.assert_allclose(funnel.level(middle), np.sqrt(arrays["rho"][:-1] * arrays["rho"][1:]))
     late = arrays["time"][-1] + np.array([0.0, 0.01, 100.0])
-    np.testing.assert_array_equal(tube.nominal(late), np.tile(arrays["x_goal"], (3, 1)))
-    np.testing.assert_array_equal(tube.value(late), np.tile(arrays["S"][-1], (3, 1, 1)))
-    np.testing.assert_allclose(tube.level(late), arrays["rho"][-1])
+    np.testing.assert_array_equal(funnel.nominal(late), np.tile(arrays["x_goal"], (3, 1)))
+    np.testing.assert_array_equal(funnel.value(late), np.tile(arrays["S"][-1], (3, 1, 1)))
+    np.testing.assert_allclose(funnel.level(late), arrays["rho"][-1])
 
 
 @pytest.mark.parametrize("plant", LOOPS)
-def test_fill_is_zero_on_the_motion_one_on_the_boundary_and_grows_with_the_square(plant):
+def test_v_over_rho_is_zero_on_the_motion_one_on_the_boundary_and_grows_with_the_square(plant):
     arrays, record = stored(plant)
-    tube = Tube.of(arrays, record)
+    funnel = interpolant(arrays, record)
     n = arrays["x"].shape[1]
     direction = np.random.default_rng(0).normal(size=(len(arrays["time"]), n))
     lengths = np.sqrt(arrays["rho"] / np.einsum("ki,kij,kj->k", direction, arrays["S"], direction))
     error = lengths[:, None] * direction
-    for scale, fill in ((0.0, 0.0), (0.5, 0.25), (1.0, 1.0), (2.0, 4.0)):
-        np.testing.assert_allclose(tube.fill(arrays["time"], arrays["x"] + scale * error), fill, atol=1e-9)
+    for scale, ratio in ((0.0, 0.0), (0.5, 0.25), (1.0, 1.0), (2.0, 4.0)):
+        np.testing.assert_allclose(funnel.ratio(arrays["time"], arrays["x"] + scale * error), ratio, atol=1e-9)
 
 
 def test_an_angle_s_error_is_not_wrapped():
     arrays, record = stored("pendulum")
     turned = arrays["x"][:1] + np.array([2 * np.pi, 0.0])
-    assert Tube.of(arrays, record).fill(arrays["time"][:1], turned)[0] > 1
+    assert interpolant(arrays, record).ratio(arrays["time"][:1], turned)[0] > 1
 
 
 @pytest.mark.parametrize("plant", LOOPS)
@@ -105,19 +109,11 @@ def test_the_linearization_is_exact_to_rounding(plant):
 
 def test_a_plant_without_a_closed_form_is_asked_of_mujoco(monkeypatch):
     arrays, record = stored("pendulum")
-    told = Tube.of(arrays, record)
+    told = interpolant(arrays, record)
     monkeypatch.delitem(CLOSED_FORMS, "pendulum")
-    asked = Tube.of(arrays, record)
-    np.testing.assert_allclose(asked.rates, told.rates, rtol=1e-8)
-    np.testing.assert_allclose(asked.slopes, told.slopes, rtol=1e-4, atol=1e-4)
+    asked = interpolant(arrays, record)
+    np.testing.assert_allclose(asked.loop.rates, told.loop.rates, rtol=1e-8)
+    np.testing.assert_allclose(asked.value_rates, told.value_rates, rtol=1e-4, atol=1e-4)
     x = np.random.default_rng(0).normal(size=(4, 2))
     expected = swing.rate(x.T, np.zeros(4)).T
     np.testing.assert_allclose(dynamics_of(asked.elite)(x, np.zeros((4, 1))), expected, rtol=1e-8)
-
-
-def test_what_has_no_funnel_or_lacks_its_weights_is_refused():
-    arrays, record = stored("pendulum")
-    with pytest.raises(UserError, match="the elite lacks Q, R"):
-        Tube.of({name: array for name, array in arrays.items() if name not in ("Q", "R")}, record)
-    with pytest.raises(UserError, match=r"rho\[0\] = 0"):
-        Tube.of(arrays | {"rho": 0 * arrays["rho"]}, record)

@@ -36,14 +36,15 @@ def export(request, tmp_path_factory):
     path = tmp_path_factory.mktemp(request.param)
     run, folder = run_folder(path / "run", request.param), path / "lab"
     export_run(run, 0, folder, Silent())
-    return Export(run, folder, read_bundle(run, "000"), _module(folder / "controller.py"))
+    bundle = read_bundle(run, "000")
+    return Export(run, folder, bundle, module(folder / f"{bundle.label}_controller.py"))
 
 
-def _module(path):
+def module(path):
     """The exported file itself, not the template that it was copied from."""
-    spec = importlib.util.spec_from_file_location(f"exported_{path.parent.parent.name}", path)
+    spec = importlib.util.spec_from_file_location(path.stem, path)
     assert spec is not None
     assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+    loaded = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(loaded)
+    return loaded

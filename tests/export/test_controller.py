@@ -1,14 +1,22 @@
 """The exported controllers, Python and C, are the loop that the run has sampled and the verification simulates."""
 
 import ctypes
+import functools
+import itertools
 import shutil
 import subprocess
+import sys
 
 import numpy as np
 import pytest
 
-from rtcd_jax.elite.closed_loop import Outcome, _outside, holding, runge_kutta, settling_time, simulate, tracking
-from rtcd_jax.elite.simulators import witnesses
+from rtcd_jax.elite.closed_loop import ClosedLoop, Outcome, _outside, runge_kutta, settling_time, simulate
+from rtcd_jax.elite.simulators import simulators_of
+from rtcd_jax.export import export_run
+from rtcd_jax.export.bundle import read_bundle
+from rtcd_jax.system.errors import UserError
+from tests.export.conftest import Silent
+from tests.export.folders import ELITES, run_folder
 
 STEPS = 10  # in an interval
 SETTLING_STEPS = 4
@@ -16,17 +24,26 @@ COMPILER = shutil.which("cc") or shutil.which("gcc")
 needs_compiler = pytest.mark.skipif(COMPILER is None, reason="no C compiler: neither cc nor gcc is on the path")
 
 
+STRICT = ["-std=c99", "-Wall", "-Wextra", "-Werror", "-pedantic"]
+OPTIMIZED = ["-O0", "-O2", "-O3 -ffast-math", "-Ofast"]
+
+
 @pytest.fixture(scope="session")
 def library(export, tmp_path_factory):
-    """The C controller as (control, monitor), called as the Python one."""
-    path = tmp_path_factory.mktemp("c") / "controller.so"
-    flags = ["-std=c99", "-O2", "-Wall", "-Wextra", "-Werror", "-pedantic", "-shared", "-fPIC"]
-    subprocess.run([COMPILER, *flags, export.folder / "controller.c", "-o", path, "-lm"], check=True)
-    return _bind(ctypes.CDLL(str(path)), export.bundle.elite)
+    """By the compiler's options: the C controller as (control, monitor), called as the Python one."""
+
+    def compiled(options):
+        path = tmp_path_factory.mktemp("c") / "controller.so"
+        source = export.folder / f"{export.bundle.label}_controller.c"
+        flags = [*STRICT, *options.split(), "-shared", "-fPIC"]
+        subprocess.run([COMPILER, *flags, source, "-o", path, "-lm"], check=True)
+        return _bind(ctypes.CDLL(str(path)), export.bundle)
+
+    return functools.cache(compiled)
 
 
-def _bind(compiled, elite):
-    n, m = elite.x_goal.size, elite.u_max.size
+def _bind(compiled, bundle):
+    n, m = bundle.elite.x_goal.size, bundle.elite.u_max.size
     vector = ctypes.c_double * n
 
     class Monitor(ctypes.Structure):
@@ -35,36 +52,33 @@ def _bind(compiled, elite):
             ("margin", ctypes.c_double),
             ("inside", ctypes.c_int),
             ("abort", ctypes.c_int),
+            ("proved", ctypes.c_int),
         )
 
-    compiled.rtcd_control.argtypes = [ctypes.c_double, vector, ctypes.c_double * m]
-    compiled.rtcd_control.restype = None
-    compiled.rtcd_watch.argtypes = [ctypes.c_double, vector, ctypes.c_double]
-    compiled.rtcd_watch.restype = Monitor
+    controller, watch = (getattr(compiled, f"{bundle.label}_{name}") for name in ("control", "watch"))
+    controller.argtypes = [ctypes.c_double, vector, ctypes.c_double * m]
+    controller.restype = None
+    watch.argtypes = [ctypes.c_double, vector, ctypes.c_double]
+    watch.restype = Monitor
 
     def control(t, x):
         u = (ctypes.c_double * m)()
-        compiled.rtcd_control(t, vector(*x), u)
+        controller(t, vector(*x), u)
         return np.array(u)
 
     def monitor(t, x):
-        return compiled.rtcd_watch(t, vector(*x), 4.0)
+        return watch(t, vector(*x), 4.0)
 
     return control, monitor
 
 
-@pytest.fixture(params=["python", pytest.param("c", marks=needs_compiler)])
+@pytest.fixture(params=["python", *(pytest.param(each, marks=needs_compiler) for each in ("-O2", "-O3 -ffast-math"))])
 def loop(request, export):
-    """The exported (control, monitor) in one language."""
-    if request.param == "c":
-        return request.getfixturevalue("library")
+    """The exported (control, monitor) in one language, C with these options."""
+    if request.param != "python":
+        return request.getfixturevalue("library")(request.param)
     controller = export.module.Controller()
     return controller.control, controller.monitor
-
-
-def axes(now):
-    """What takes the unit ball to the funnel's section, less its center."""
-    return np.sqrt(now.level) * np.linalg.inv(np.linalg.cholesky(now.value)).T
 
 
 def around_the_funnel(bundle, count, reach, seed):
@@ -74,15 +88,15 @@ def around_the_funnel(bundle, count, reach, seed):
         now = bundle.at(t)
         direction = random.normal(size=n)
         away = random.uniform(0, reach) * direction / np.linalg.norm(direction)
-        yield t, now.x + axes(now) @ away, away @ away
+        yield t, now.x + now.axes @ away, away @ away
 
 
 def test_the_input_is_that_of_the_verifications_loop(export, loop):
     elite, control = export.bundle.elite, loop[0]
-    f = next(witnesses(elite, 2)).dynamics
+    loop_of = ClosedLoop.of(elite, next(simulators_of(elite, 2)).dynamics)
     for t, x, _ in around_the_funnel(export.bundle, 200, reach=3, seed=0):
         k = int(t / elite.time[1])
-        policy = tracking(elite, f, k) if t < elite.time[-1] else holding(elite)
+        policy = loop_of.tracking(k) if t < elite.time[-1] else loop_of.holding()
         np.testing.assert_allclose(control(t, x), policy(t, x[None])[0], rtol=1e-8, atol=1e-8)
 
 
@@ -101,7 +115,7 @@ def test_the_monitor_says_inside_and_abort_on_both_sides_of_the_boundary(export,
     bundle, monitor = export.bundle, loop[1]
     t = 0.6 * bundle.elite.time[-1]
     now = bundle.at(t)
-    direction = axes(now)[:, 0]
+    direction = now.axes[:, 0]
     for radius, inside, abort in ((0.0, True, False), (0.999, True, False), (1.001, False, False), (2.01, False, True)):
         watch = monitor(t, now.x + radius * direction)
         assert (bool(watch.inside), bool(watch.abort)) == (inside, abort)
@@ -133,11 +147,24 @@ def test_what_is_no_number_gives_no_input_and_the_advice_to_abort(export, loop, 
     for i in range(elite.x_goal.size):
         x = elite.x[0] + 0.1
         x[i] = bad
-        np.testing.assert_array_equal(control(0.01, x), 0)
-        assert bool(monitor(0.01, x).abort)
-        assert not monitor(0.01, x).inside
+        for t in (0.01, 2 * elite.time[-1]):
+            np.testing.assert_array_equal(control(t, x), 0)
+            assert bool(monitor(t, x).abort)
+            assert not monitor(t, x).inside
     np.testing.assert_array_equal(control(bad, elite.x[0] + 0.1), 0)
     assert bool(monitor(bad, elite.x[0]).abort)
+    assert not monitor(bad, elite.x[0]).inside
+
+
+def test_a_state_too_large_for_the_arithmetic_is_outside_and_gives_no_number_to_the_motor(export, loop):
+    """V and K x overflow, with both signs among their terms."""
+    elite, (control, monitor) = export.bundle.elite, loop
+    for signs in itertools.product((-1, 1), repeat=elite.x_goal.size):
+        for t in (0.01, 2 * elite.time[-1]):
+            x = 1.7e308 * np.array(signs)
+            assert np.abs(control(t, x)) <= elite.u_max
+            assert bool(monitor(t, x).abort)
+            assert not monitor(t, x).inside
 
 
 def test_before_the_start_its_first_instant_is_held(export, loop):
@@ -150,14 +177,14 @@ def test_before_the_start_its_first_instant_is_held(export, loop):
 def test_c_mujoco_under_the_exported_controller_gives_the_verifications_outcome(export, loop):
     """The same states, half of them far outside the funnel, step by step: the same verdicts on every one."""
     elite, (control, monitor) = export.bundle.elite, loop
-    witness = next(witnesses(elite, 24))
+    simulator = next(simulators_of(elite, 24))
     knots, states = elite.sample(24, np.random.default_rng(3))
     states[::2] = elite.x[knots[::2]] + 4 * (states[::2] - elite.x[knots[::2]])
-    march = runge_kutta(witness.dynamics, elite.time[1] / STEPS)
-    expected = simulate(elite, witness.dynamics, march, knots, states)
+    march = runge_kutta(simulator.dynamics, elite.time[1] / STEPS)
+    expected = simulate(elite, simulator.dynamics, march, knots, states)
     assert 0 < expected.failed.sum() < len(states)
 
-    exported = _driven(elite, control, monitor, march, witness.dynamics, knots, states)
+    exported = _driven(elite, control, monitor, march, simulator.dynamics, knots, states)
     for kind in ("left_funnel", "left_limits", "missed_goal"):
         np.testing.assert_array_equal(getattr(exported, kind), getattr(expected, kind))
 
@@ -226,25 +253,121 @@ def test_what_is_returned_may_be_changed(export):
     np.testing.assert_array_equal(controller.control(np.nan, export.bundle.elite.x[0]), 0)
 
 
-def test_both_self_tests_pass_and_can_fail(export, tmp_path):
+def changed(folder, row, column, value):
+    """The test vectors with one cell replaced."""
+    path = folder / "test_vectors.csv"
+    lines = path.read_text().splitlines()
+    cells = lines[row].split(",")
+    cells[column] = value
+    lines[row] = ",".join(cells)
+    path.write_text("\n".join(lines) + "\n")
+
+
+WRONG = {
+    "ratio": (7, -4, "1.25"),
+    "inside": (-1, -3, "1"),
+    "input of no number": (-1, -5, "1.0"),
+    "abort": (-1, -2, "0"),
+}
+
+
+@pytest.mark.parametrize("where", WRONG)
+def test_the_self_test_passes_and_can_fail(export, tmp_path, where):
     folder = shutil.copytree(export.folder, tmp_path / "copy")
     assert export.module.self_test(folder) < 1e-9
-    lines = (folder / "test_vectors.csv").read_text().splitlines()
-    cells = lines[7].split(",")
-    cells[-1] = repr(float(cells[-1]) + 0.01)
-    lines[7] = ",".join(cells)
-    (folder / "test_vectors.csv").write_text("\n".join(lines) + "\n")
+    row, column, value = WRONG[where]
+    changed(folder, row, column, value)
     assert export.module.self_test(folder) > 1e-3
 
 
 @needs_compiler
-def test_the_c_self_test_compiles_without_warnings_passes_and_can_fail(export, tmp_path):
-    folder = shutil.copytree(export.folder, tmp_path / "copy")
-    flags = ["-std=c99", "-O2", "-Wall", "-Wextra", "-Werror", "-pedantic"]
-    subprocess.run([COMPILER, *flags, "controller_test.c", "controller.c", "-lm", "-o", "t"], cwd=folder, check=True)
+@pytest.mark.parametrize("options", OPTIMIZED)
+def test_the_c_self_test_compiles_without_warnings_passes_and_can_fail(export, tmp_path, options):
+    folder, label = shutil.copytree(export.folder, tmp_path / "copy"), export.bundle.label
+    sources = [f"{label}_controller_test.c", f"{label}_controller.c"]
+    subprocess.run([COMPILER, *STRICT, *options.split(), *sources, "-lm", "-o", "t"], cwd=folder, check=True)
+    rows = 400 + 3 * (1 + export.bundle.elite.x_goal.size)
     done = subprocess.run(["./t"], cwd=folder, capture_output=True, text=True)
-    assert (done.returncode, done.stdout[:16]) == (0, "ok: 400 vectors,")
-    text = (folder / "test_vectors.csv").read_text()
-    (folder / "test_vectors.csv").write_text(text.replace("\n", "\n0.01,", 1).replace("0.01,0.", "0.011,0.", 1))
-    assert subprocess.run(["./t"], cwd=folder, capture_output=True).returncode == 1
+    assert (done.returncode, done.stdout[:16]) == (0, f"ok: {rows} vectors,")
+    original = (folder / "test_vectors.csv").read_text()
+    for row, column, value in WRONG.values():
+        changed(folder, row, column, value)
+        assert subprocess.run(["./t"], cwd=folder, capture_output=True).returncode == 1
+        (folder / "test_vectors.csv").write_text(original)
     assert subprocess.run(["./t", "none.csv"], cwd=folder, capture_output=True).returncode == 2
+
+
+TWO = """
+#include <stdio.h>
+#include "{one}_controller.h"
+#include "{two}_controller.h"
+
+int main(void)
+{{
+    double x[{ONE}_STATES], y[{TWO}_STATES], u[{ONE}_INPUTS], v[{TWO}_INPUTS];
+    {one}_nominal(0.01, x);
+    {two}_nominal(0.01, y);
+    {one}_control(0.01, x, u);
+    {two}_control(0.01, y, v);
+    const {one}_monitor a = {one}_watch(0.01, x, {ONE}_ABORT_RATIO);
+    const {two}_monitor b = {two}_watch(0.01, y, {TWO}_ABORT_RATIO);
+    printf("%.17g %.17g %d %d", u[0], v[0], a.inside, b.inside);
+    return 0;
+}}
+"""
+
+
+@pytest.fixture(scope="module")
+def two(tmp_path_factory):
+    """The exports of two robots in one folder each, with their bundles."""
+    path = tmp_path_factory.mktemp("two")
+    bundles = {}
+    for plant in ELITES:
+        run = run_folder(path / plant, plant)
+        export_run(run, 0, path / f"lab_{plant}", Silent())
+        bundles[plant] = read_bundle(run, "000")
+    return path, bundles
+
+
+@needs_compiler
+def test_two_exports_live_in_one_c_program(two):
+    path, bundles = two
+    (one, first), (other, second) = bundles.items()
+    (path / "both.c").write_text(
+        TWO.format(one=first.label, two=second.label, ONE=first.label.upper(), TWO=second.label.upper())
+    )
+    folders, sources = [path / f"lab_{plant}" for plant in (one, other)], ["both.c"]
+    sources += [
+        folder / f"{bundle.label}_controller.c" for folder, bundle in zip(folders, bundles.values(), strict=True)
+    ]
+    includes = [f"-I{folder}" for folder in folders]
+    subprocess.run([COMPILER, *STRICT, *includes, *sources, "-lm", "-o", "both"], cwd=path, check=True)
+    done = subprocess.run(["./both"], cwd=path, capture_output=True, text=True, check=True).stdout.split()
+    expected = [float(bundle.at(0.01).u[0]) for bundle in bundles.values()]
+    np.testing.assert_allclose([float(u) for u in done[:2]], expected, rtol=1e-12)
+    assert done[2:] == ["1", "1"]
+
+
+def test_two_exports_live_in_one_python_process(two):
+    """As the folder's README imports them."""
+    path, bundles = two
+    program = "import sys\n"
+    for plant, bundle in bundles.items():
+        program += f"sys.path.insert(0, {str(path / f'lab_{plant}')!r})\n"
+        program += f"import {bundle.label}_controller as {plant}\nprint(len({plant}.Controller().x_goal))\n"
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    assert done.stdout.split() == ["2", "4"]
+
+
+@needs_compiler
+def test_two_elites_of_one_robot_are_told_apart_by_a_name(tmp_path):
+    run = run_folder(tmp_path / "run", "pendulum")
+    for label in ("before", "after"):
+        export_run(run, 0, tmp_path / label, Silent(), label)
+        assert (tmp_path / label / f"{label}_controller.py").is_file()
+        flags = [*STRICT, "-c", f"{label}_controller.c", "-o", f"../{label}.o"]
+        subprocess.run([COMPILER, *flags], cwd=tmp_path / label, check=True)
+    merged = subprocess.run([shutil.which("ld") or "ld", "-r", "before.o", "after.o", "-o", "both.o"], cwd=tmp_path)
+    assert merged.returncode == 0
+    with pytest.raises(UserError, match=r"name 'my-robot': must be a letter and up to 63 letters, digits and _"):
+        export_run(run, 0, tmp_path / "third", Silent(), "my-robot")

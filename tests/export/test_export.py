@@ -61,7 +61,7 @@ def test_the_tables_read_back_to_the_elites_own_numbers(export):
 
 
 def test_the_bundle_says_what_its_numbers_mean(export):
-    told = json.loads((export.folder / "controller.json").read_text())
+    told = json.loads((export.folder / f"{export.bundle.label}_controller.json").read_text())
     elite = export.bundle.elite
     assert [state["name"] for state in told["states"]] == list(export.bundle.plant.state_names)
     limits = [None if state["limit"] is None else state["limit"] for state in told["states"]]
@@ -113,21 +113,90 @@ def test_exports_of_the_same_elite_are_equal_bit_by_bit(export, tmp_path):
     assert "is in" in console.lines[0]
 
 
+def listing(target, **files):
+    """The mark of the export in `target`, with further files in it, by name and content."""
+    mark = json.loads((target / "export.json").read_text())
+    mark["files"] |= {name: hashlib.sha256(content).hexdigest() for name, content in files.items()}
+    (target / "export.json").write_text(json.dumps(mark))
+
+
 def test_a_former_export_is_replaced_and_its_stale_files_go(run, tmp_path):
     target = tmp_path / "lab"
     export_run(run, 0, target, Silent())
-    mark = json.loads((target / "export.json").read_text())
     (target / "certificate.json").write_text("old")
     (target / "notes.txt").write_text("mine")
-    (target / "export.json").write_text(json.dumps(mark | {"files": mark["files"] | {"certificate.json": "0"}}))
     (target / "gains.csv").write_text("old")
+    listing(target, **{"certificate.json": b"old"})
     console = Silent()
     export_run(run, "initial", target, console)
     assert "elite initial" in console.lines[0]
     assert "replaces the former export" in console.lines[0]
     assert not (target / "certificate.json").exists()
+    assert not (target / "pendulum_000_controller.py").exists()
+    assert (target / "pendulum_initial_controller.py").is_file()
     assert (target / "notes.txt").read_text() == "mine"
     assert (target / "gains.csv").read_text() != "old"
+
+
+@pytest.mark.parametrize("name", ["../precious.txt", "{absolute}", "sub/../../precious.txt", "..\\precious.txt"])
+def test_what_a_former_exports_mark_names_elsewhere_is_not_touched(run, tmp_path, name):
+    target, precious = tmp_path / "lab", tmp_path / "precious.txt"
+    precious.write_text("mine")
+    export_run(run, 0, target, Silent())
+    (target / "sub").mkdir()
+    listing(target, **{name.format(absolute=precious): b"mine"})
+    export_run(run, 0, target, Silent())
+    assert precious.read_text() == "mine"
+
+
+def test_no_link_is_followed_or_deleted(run, tmp_path):
+    target, precious = tmp_path / "lab", tmp_path / "precious.txt"
+    precious.write_text("mine")
+    export_run(run, 0, target, Silent())
+    for name in ("stale.txt", "gains.csv", ".funnel.csv.tmp"):
+        (target / name).unlink(missing_ok=True)
+        (target / name).symlink_to(precious)
+    listing(target, **{"stale.txt": b"mine"})
+    console = Silent()
+    export_run(run, 0, target, console)
+    assert precious.read_text() == "mine"
+    assert (target / "stale.txt").is_symlink()
+    assert not (target / "gains.csv").is_symlink()
+    assert any("left where they are" in line and "stale.txt" in line for line in console.lines)
+
+
+def test_a_file_that_was_changed_since_is_not_deleted(run, tmp_path):
+    target = tmp_path / "lab"
+    export_run(run, 0, target, Silent())
+    edited = target / "pendulum_000_controller.py"
+    edited.write_text("# mine")
+    console = Silent()
+    export_run(run, "initial", target, console)
+    assert edited.read_text() == "# mine"
+    assert any("pendulum_000_controller.py" in line for line in console.lines)
+    assert not (target / "pendulum_000_controller.c").exists()
+
+
+def test_a_file_that_no_export_has_written_is_not_replaced(run, tmp_path):
+    target = tmp_path / "lab"
+    export_run(run, 0, target, Silent())
+    mark = json.loads((target / "export.json").read_text())
+    del mark["files"]["README.md"]
+    (target / "export.json").write_text(json.dumps(mark))
+    (target / "README.md").write_text("mine")
+    with pytest.raises(UserError, match=r"lab has README.md, which the former export has not written: move it away"):
+        export_run(run, 0, target, Silent())
+    assert (target / "README.md").read_text() == "mine"
+
+
+@pytest.mark.parametrize("mark", ["[]", '{"format": "rtcd_jax export", "files": ["thesis.tex"]}', "[" * 100_000])
+def test_a_mark_that_no_export_has_written_is_none(run, tmp_path, mark):
+    target = tmp_path / "lab"
+    target.mkdir()
+    (target / "export.json").write_text(mark)
+    (target / "thesis.tex").write_text("all")
+    with pytest.raises(UserError, match="is not empty and no former export"):
+        export_run(run, 0, target, Silent())
 
 
 def test_an_export_that_a_kill_has_left_half_done_says_so_and_is_taken_up(run, tmp_path, monkeypatch):
@@ -169,7 +238,7 @@ def test_an_elite_that_is_not_there_is_answered_with_those_that_are(run, tmp_pat
 
 def test_a_candidate_without_a_funnel_is_not_exported(tmp_path):
     run = run_folder(tmp_path / "run", "pendulum", status="FUNNEL_EMPTY")
-    with pytest.raises(UserError, match=r"initial has no funnel to export \(FUNNEL_EMPTY\)"):
+    with pytest.raises(UserError, match=r"initial has no funnel \(FUNNEL_EMPTY\)"):
         export_run(run, "initial", tmp_path / "lab", Silent())
 
 
@@ -188,7 +257,7 @@ def test_a_certificate_goes_along_if_it_is_of_this_controller(run, tmp_path, sam
     (run / "certificates" / "summary.json").write_text('{"000": {"rung": "proved", "start": 0.0}}')
     console = Silent()
     export_run(run, 0, tmp_path / "lab", console)
-    told = json.loads((tmp_path / "lab" / "controller.json").read_text())["certificate"]
+    told = json.loads((tmp_path / "lab" / "pendulum_000_controller.json").read_text())["certificate"]
     assert (tmp_path / "lab" / "certificate.json").is_file() == same
     assert (told is not None) == same
     if same:

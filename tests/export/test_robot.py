@@ -2,11 +2,14 @@
 # pyright: reportAttributeAccessIssue=false
 # (mujoco ships no types for its native module.)
 
+from xml.etree import ElementTree as Xml
+
 import mujoco
 import numpy as np
 import pytest
 
 from rtcd_jax.export import robot
+from rtcd_jax.plants.mjx import CpuDynamics
 from rtcd_jax.plants.pendulum import Pendulum
 
 
@@ -61,6 +64,55 @@ def test_the_urdf_says_how_strong_a_motor_is_and_where_a_slide_ends(export):
     else:
         assert 'type="continuous"' in text
         assert 'effort="2.5" velocity="7.0"' in text
+
+
+def test_drake_finds_the_urdfs_joints_and_actuators_and_the_designs_accelerations(export):
+    pytest.importorskip("pydrake")
+    from pydrake.multibody.parsing import Parser
+    from pydrake.multibody.plant import MultibodyPlant
+
+    plant, ours = MultibodyPlant(0.0), export.bundle.model
+    Parser(plant).AddModels(str(export.folder / "robot.urdf"))
+    plant.Finalize()
+    motors = [plant.get_joint_actuator(i) for i in plant.GetJointActuatorIndices()]
+    assert [motor.joint().name() for motor in motors] == [ours.joint(int(j)).name for j in export.bundle.joints]
+    assert [motor.effort_limit() for motor in motors] == export.bundle.elite.u_max.tolist()
+    context = plant.CreateDefaultContext()
+    for x, u, rates in _motions(export.bundle):
+        plant.SetPositionsAndVelocities(context, x)
+        plant.get_actuation_input_port().FixValue(context, u)
+        derivatives = plant.EvalTimeDerivatives(context).CopyToVector()
+        np.testing.assert_allclose(derivatives, rates, rtol=1e-7, atol=1e-7)
+
+
+def test_pinocchio_moves_the_urdf_as_the_design(export):
+    pinocchio = pytest.importorskip("pinocchio")
+    model, ours = pinocchio.buildModelFromUrdf(str(export.folder / "robot.urdf")), export.bundle.model
+    assert list(model.names)[1:] == [ours.joint(i).name for i in range(ours.njnt)]
+    data, half = model.createData(), ours.nv
+    turns = [model.joints[i + 1].nq == 2 for i in range(half)]  # (cos, sin)
+    for x, u, rates in _motions(export.bundle):
+        q = np.concatenate([[np.cos(a), np.sin(a)] if turn else [a] for a, turn in zip(x[:half], turns, strict=True)])
+        tau = -model.damping * x[half:]
+        tau[export.bundle.joints] += u
+        np.testing.assert_allclose(pinocchio.aba(model, data, q, x[half:], tau), rates[half:], rtol=1e-7, atol=1e-7)
+
+
+def _motions(bundle):
+    """States, inputs and the state's rates by the exported design's own MuJoCo model."""
+    random, n, m = np.random.default_rng(1), bundle.elite.x_goal.size, bundle.elite.u_max.size
+    f = CpuDynamics(bundle.model, n + m)
+    for x, u in zip(random.uniform(-2, 2, (10, n)), random.uniform(-2, 2, (10, m)), strict=True):
+        yield x, u, f(x[None], u[None])[0]
+
+
+def test_every_input_has_a_transmission_of_its_own(export):
+    """Where Drake and ROS look for motors."""
+    model, root = export.bundle.model, Xml.parse(export.folder / "robot.urdf").getroot()
+    driven = [(each.find("joint").get("name"), each.find("actuator").get("name")) for each in root.iter("transmission")]
+    expected = [(model.joint(int(j)).name, model.actuator(i).name) for i, j in enumerate(export.bundle.joints)]
+    assert driven == expected
+    assert len(driven) == export.bundle.elite.u_max.size
 
 
 def test_an_edit_that_the_file_cannot_take_is_refused_by_name():

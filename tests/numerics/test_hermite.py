@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from rtcd_jax.numerics.hermite import cubic_hermite
+from rtcd_jax.numerics.hermite import cubic_hermite, cubic_hermite_rate
 
 
 @pytest.mark.parametrize("duration", [0.05, 1.0, 3.0])
@@ -11,8 +11,10 @@ def test_every_cubic_is_reproduced(duration):
     cubic = np.polynomial.Polynomial([0.3, -1.0, 2.0, 0.7])
     rate = cubic.deriv()
     shares = np.linspace(0, 1, 9)
-    curve = cubic_hermite(shares, duration, cubic(0), rate(0), cubic(duration), rate(duration))
-    np.testing.assert_allclose(curve, cubic(shares * duration), rtol=1e-13, atol=1e-13)
+    ends = cubic(0), rate(0), cubic(duration), rate(duration)
+    np.testing.assert_allclose(cubic_hermite(shares, duration, *ends), cubic(shares * duration), rtol=1e-13, atol=1e-13)
+    rates = cubic_hermite_rate(shares, duration, *ends)
+    np.testing.assert_allclose(rates, rate(shares * duration), rtol=1e-12, atol=1e-12)
 
 
 def test_ends_are_met_exactly_and_rates_by_differences():

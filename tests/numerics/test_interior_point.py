@@ -210,3 +210,18 @@ def test_single_precision_stays_single():
     shapes = jax.eval_shape(lambda parameters: solve(CART, parameters, single, jnp.full(6, MOST)), parameters)
     for name in ("us", "xs", "h", "cost", "defect"):
         assert getattr(shapes, name).dtype == jnp.float32
+
+
+def test_a_step_whose_box_has_no_width_is_held_and_the_effort_is_the_least_for_it():
+    """On a double integrator: the shortest vector of inputs that meets both end conditions."""
+    h = 0.3
+    fixed = CART._replace(step_limits=(h, h), state_limits=np.full(2, np.inf))
+    frugal = {key: jnp.asarray(value[FRUGAL : FRUGAL + 1]) for key, value in PARAMETERS.items()}
+    found = jax.jit(lambda: solve(fixed, frugal, guess(h), jnp.array([MOST])))()
+    assert found.solved.all()
+    assert float(found.h[0]) == h
+    ahead = N - np.arange(N) - 0.5
+    inputs = np.linalg.pinv(np.stack([h**2 * ahead, np.full(N, h)])) @ [1.0, 0.0]
+    assert np.abs(inputs).max() < FORCE
+    np.testing.assert_allclose(found.us[:, 0, 0], inputs, atol=1e-3 * inputs.max())
+    np.testing.assert_allclose(found.cost[0], h * inputs @ inputs / 2, rtol=1e-6)

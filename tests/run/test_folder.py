@@ -21,6 +21,7 @@ from rtcd_jax.run.folder import RunFolder
 from rtcd_jax.search import search
 from rtcd_jax.system import files
 from rtcd_jax.system.errors import UserError
+from tests.paths import ROOT
 from tests.search.fake_evaluation import bowl
 from tests.search.search_driver import begin, drive, experiment, plan_of
 
@@ -374,7 +375,6 @@ import jax.numpy as jnp
 from rtcd_jax.system.errors import UserError
 from rtcd_jax.run.folder import RunFolder
 from tests.search.search_driver import experiment
-from tests.paths import ROOT
 
 def attempt(name, action):
     try:

@@ -136,12 +136,22 @@ def test_the_stored_configuration_is_the_runs(finished, small):
 
 
 def test_a_finished_run_says_so_and_is_left_as_it_is(finished, small):
-    before = contents(finished)
+    before = contents(finished) | {"page": (finished / "report.html").read_bytes()}
     code, output, errors = small.optimize(finished)
     assert code == 0, errors
     assert f"is complete: {GENERATIONS} generations, {len(elite_names(finished))} elites" in output
     assert "generation 1/" not in output
-    assert contents(finished) == before
+    assert contents(finished) | {"page": (finished / "report.html").read_bytes()} == before
+
+
+def test_a_finished_run_without_its_page_gets_it_and_nothing_else(finished, small, tmp_path):
+    folder = tmp_path / "whole"
+    shutil.copytree(finished, folder, ignore=shutil.ignore_patterns("report.html", "figures"))
+    code, output, errors = small.optimize(folder)
+    assert code == 0, errors
+    assert "is complete" in output
+    assert "<h1>whole</h1>" in (folder / "report.html").read_text()
+    assert contents(folder) == contents(finished)
 
 
 def test_another_configuration_is_refused_by_its_key(finished, small):
@@ -238,11 +248,13 @@ def test_a_run_killed_while_it_stores_its_elites_stores_them_all(finished, small
     assert len(elite_names(folder)) == 2
     for lost in (folder / "elites" / "001.npz", folder / "elites" / "001.json", folder / LAST_FILE):
         lost.unlink()
+    (folder / "report.html").write_text("of before")
     code, output, errors = small.optimize(folder)
     assert code == 0, errors
     assert "generation 1/" not in output
     assert contents(folder) == contents(finished)
     assert (folder / LAST_FILE).is_file()
+    assert "<h1>torn</h1>" in (folder / "report.html").read_text()
 
 
 # ---- with a fake evaluation, whose volumes are a known function of the genome
@@ -272,18 +284,3 @@ def test_elites_that_were_only_lucky_are_not_reported(monkeypatch, tmp_path):
     with pytest.raises(UserError, match="none of the elites kept a funnel under more samples"):
         _run_with(monkeypatch, bowl, tmp_path / "run")
     assert not (tmp_path / "run" / "elites").exists()
-
-
-def test_a_failing_report_ends_nothing(monkeypatch, tmp_path):
-    """The run is finished; what went wrong is told, with the command that tries again."""
-
-    def broken(_):
-        raise RuntimeError("no fonts")
-
-    monkeypatch.setattr(run, "report", broken)
-    stream = io.StringIO()
-    with Console(stream) as console:
-        run._report(tmp_path, console)
-    assert stream.getvalue() == (
-        f"the run is finished, but its report failed: RuntimeError('no fonts'); `rtcd report {tmp_path}` makes it\n"
-    )

@@ -11,6 +11,7 @@ import pytest
 from rtcd_jax.run.sharding import spread
 from rtcd_jax.system.cluster import Cluster, Preempted
 from rtcd_jax.system.errors import UserError
+from tests.paths import ROOT
 from tests.pipeline import same
 from tests.search.fake_evaluation import bowl
 
@@ -80,7 +81,6 @@ from rtcd_jax.evaluation import make_evaluate
 from rtcd_jax.run.sharding import spread
 from tests import pipeline
 from tests.test_evaluation import _assert_close
-from tests.paths import ROOT
 evaluate, rows = make_evaluate(pipeline.problem()), np.arange(5)
 
 def on(devices, genomes):

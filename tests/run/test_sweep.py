@@ -62,6 +62,10 @@ def test_keys_of_one_last_name_are_told_apart(tmp_path):
         ({"product": {"search.seed": [1, -1]}}, r"case 001_seed=-1: search.seed = -1: must be >= 0"),
         ({"product": {"search.seed.deep": [1]}}, r"sweep.search.seed.deep: leads to no place in the file"),
         ({"product": {"weights.r.7.max": [1]}}, r"sweep.weights.r.7.max: leads to no place in the file"),
+        (
+            {"product": {f"{key}.directions": list(range(1, 102)) for key in ("funnel", "elites")}},
+            "sweep: makes 10201 runs, must make 10000 at most",
+        ),
     ],
 )
 def test_what_is_wrong_is_named(tmp_path, sweep, message):

@@ -18,8 +18,9 @@ from jaxtyping import Float
 from rtcd_jax.analysis.animate.camera import Camera, choose_backend
 from rtcd_jax.analysis.animate.motion import Motions, dynamics_before_mujoco, frame_times, motions
 from rtcd_jax.config.load import Config
-from rtcd_jax.elite.funnel import Tube
-from rtcd_jax.elite.records import read_config, read_elite, require_elites
+from rtcd_jax.elite.elite import Elite, initial_and_best
+from rtcd_jax.elite.funnel import FunnelInterpolant
+from rtcd_jax.elite.records import read_config, require_elites
 from rtcd_jax.system.errors import UserError
 from rtcd_jax.system.files import make_folder, writing
 
@@ -118,34 +119,25 @@ def ffmpeg() -> str | None:
 
 def _columns(folder: Path, config: Config, seed: int, console: Console) -> list[Column]:
     """The initial candidate, if it has a funnel, and the best, from the same two starts."""
-    tubes = {}
-    for label, place, name in (("initial", folder, "initial"), ("best", folder / "elites", "000")):
-        if label == "initial" and not (place / "initial.json").is_file():
-            continue
-        arrays, record = read_elite(place, name)
-        if record.get("status") == "OK":
-            tubes[label] = Tube.of(arrays, record)
-        else:
-            console.message(f"{label}: nothing to show, it has no funnel ({record.get('status')})")
-    if "best" not in tubes:
-        raise UserError(f"{folder / 'elites'}: 000 has no funnel")
-    disturbed = _disturbed(tubes["best"], seed)
+    elites, absence = initial_and_best(folder)
+    if absence:
+        console.message(f"{absence}: the best elite is shown alone")
+    disturbed = _disturbed(elites["best"], seed)
     starts = np.stack([np.array(config.task.start), disturbed])
-    time = frame_times(list(tubes.values()), HOLD, RATE)
+    time = frame_times(list(elites.values()), HOLD, RATE)
     console.message(
         "disturbed start, from the best funnel's first ellipsoid: "
         + ", ".join(f"{name} = {value:.4g}" for name, value in zip(config.plant.states, disturbed, strict=True))
     )
     columns = []
-    for label, tube in tubes.items():
-        model, f = dynamics_before_mujoco(tube, len(starts))
-        columns.append(Column(label, model, motions(tube, f, starts, time)))
+    for label, elite in elites.items():
+        model, f = dynamics_before_mujoco(elite, len(starts))
+        columns.append(Column(label, model, motions(FunnelInterpolant.of(elite), f, starts, time)))
     return columns
 
 
-def _disturbed(tube: Tube, seed: int) -> np.ndarray:
+def _disturbed(elite: Elite, seed: int) -> np.ndarray:
     """A state in a random direction from the first knot, near the boundary of its ellipsoid."""
-    elite = tube.elite
     _, drawn = elite.sample(1, np.random.default_rng(seed))
     return elite.x[0] + np.sqrt(NEAR * elite.rho[0] / elite.value(0, drawn)) * (drawn[0] - elite.x[0])
 
@@ -179,8 +171,8 @@ def _write_on(panel: "Image", column: Column, k: int, row: int) -> None:
     draw.text((14, 8), column.label, fill=_INK, font=large)
     draw.text((14, 36), ("undisturbed", "disturbed start")[row], fill=_INK, font=small)
     draw.text((SIDE - 14, 8), f"{column.motions.time[k]:.2f} s", fill=_INK, font=large, anchor="ra")
-    fill = column.motions.fill[k, row]
-    text, color = (f"in its funnel, V/ρ = {fill:.2f}", _GOOD) if fill <= 1 else ("outside its funnel", _BAD)
+    ratio = column.motions.ratio[k, row]
+    text, color = (f"in its funnel, V/ρ = {ratio:.2f}", _GOOD) if ratio <= 1 else ("outside its funnel", _BAD)
     draw.text((14, SIDE - 12), text, fill=color, font=small, anchor="ld")
 
 

@@ -22,13 +22,11 @@ from rtcd_jax.analysis.disturb.scenarios import (
     start,
     steps_of,
 )
-from rtcd_jax.elite.closed_loop import ARRIVED, FORGOTTEN, settling_time
-from rtcd_jax.elite.elite import Elite
-from rtcd_jax.elite.records import read_elite, require_elites
+from rtcd_jax.elite.closed_loop import ARRIVED, FORGOTTEN, ClosedLoop, settling_time
+from rtcd_jax.elite.elite import Elite, initial_and_best
+from rtcd_jax.elite.simulators import dynamics_of
 from rtcd_jax.plants import plant_class
 from rtcd_jax.plants.base import Plant
-from rtcd_jax.plants.mjx import CpuDynamics, model_of
-from rtcd_jax.system.errors import UserError
 
 BATCH = 2048
 """Lanes in the compiled program."""
@@ -105,29 +103,18 @@ def read_contest(folder: Path, console: Console) -> Contest:
     Raises:
         UserError: no elites, or a folder that cannot be read.
     """
-    require_elites(folder)
-    read: dict[str, tuple[Elite, dict[str, Any]]] = {}
-    for name, place, file in (("initial", folder, "initial"), ("best", folder / "elites", "000")):
-        arrays, record = read_elite(place, file)
-        if record.get("status") == "OK":
-            read[name] = Elite.of(arrays, record), record
-        else:
-            console.message(f"{name}: left out, it has no funnel ({record.get('status')})")
-    if "best" not in read:
-        raise UserError(f"{folder} has no elite with a funnel to disturb")
-    return contest_of({name: elite for name, (elite, _) in read.items()}, read["best"][1].get("config_hash"))
+    elites, absence = initial_and_best(folder)
+    if absence:
+        console.message(f"{absence}: the best elite is disturbed alone")
+    return contest_of(elites, elites["best"].record.get("config_hash"))
 
 
 def contest_of(elites: dict[str, Elite], config_hash: str | None) -> Contest:
     """Elites of the same run, by name."""
     robots = [plant_class(elite.plant).from_parameters(elite.parameters) for elite in elites.values()]
-    rates, ends = [], []
-    for elite, (plant, design) in zip(elites.values(), robots, strict=True):
-        rate = jax.vmap(lambda x, u, plant=plant, design=design: plant.dynamics(design, x, u))
-        rates.append(np.stack([np.asarray(rate(side, elite.u)) for side in (elite.x[:-1], elite.x[1:])], axis=1))
-        columns = elite.x_goal.size + elite.u_max.size
-        witness = CpuDynamics(model_of(elite.plant, elite.parameters), columns)
-        ends.append(elite.time[-1] + settling_time(elite, witness))
+    dynamics = [dynamics_of(elite) for elite in elites.values()]
+    rates = [ClosedLoop.of(elite, f).rates for elite, f in zip(elites.values(), dynamics, strict=True)]
+    ends = [elite.time[-1] + settling_time(elite, f) for elite, f in zip(elites.values(), dynamics, strict=True)]
     plant, design = jax.tree.map(lambda *leaves: jnp.stack([jnp.asarray(leaf, float) for leaf in leaves]), *robots)
     loops = Loops.of(list(elites.values()), rates)
     return Contest(tuple(elites), tuple(elites.values()), plant, design, loops, max(ends), config_hash)

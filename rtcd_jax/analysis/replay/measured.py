@@ -1,101 +1,139 @@
-"""Measured motions as CSV files with the columns of the DFKI toolkits: time, positions, velocities, torques.
+"""Measured motions from the CSV files of labs, in SI units."""
 
-    one joint    time,pos,vel,torque
-    two joints   time,pos1,pos2,vel1,vel2,tau1,tau2
-
-SI units, the time [s] from the start of the swing-up. Torques and other columns may be absent and are not looked at.
-"""
-
-import csv
-from collections.abc import Sequence
-from dataclasses import dataclass
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import final
 
 import numpy as np
 from jaxtyping import Float
 
-from rtcd_jax.system.errors import UserError
+from rtcd_jax.analysis.replay.columns import Column, find_columns
+from rtcd_jax.system.delimited import Table, listed, number_in, read_table, shown
+from rtcd_jax.system.errors import UserError, printable
 
-TORQUES = {1: ["torque"], 2: ["tau1", "tau2"]}
+WHAT = "a CSV of measured states, a line of column names above its rows"
+LARGEST = 1e12
+"""Largest size of a time or a state that can be a measurement [SI units]."""
 
 
 @final
 @dataclass(frozen=True)
 class Measured:
-    """Times, ascending [s], and states (positions, then velocities) in SI units."""
+    """Times, ascending [s], and states (positions, then velocities) in SI units.
 
-    columns: tuple[str, ...]
+    `columns` says which column was taken for the time and for every state; `notes`, what was left out or changed.
+    """
+
+    columns: Mapping[str, Column]
     time: Float[np.ndarray, " T"]
     x: Float[np.ndarray, "T n"]
+    notes: tuple[str, ...] = ()
+
+    @property
+    def states(self) -> tuple[str, ...]:
+        """The names of the states."""
+        return tuple(self.columns)[1:]
 
 
-def columns_of(n: int) -> list[str]:
-    """The columns that a file of `n` states needs, in the state's order behind the time."""
-    joints = n // 2
-    numbers = [""] if joints == 1 else [str(i + 1) for i in range(joints)]
-    return ["time", *(f"{kind}{number}" for kind in ("pos", "vel") for number in numbers)]
+def read_measured(
+    path: Path, states: Mapping[str, str], choices: Sequence[str] = (), start: float | None = None
+) -> Measured:
+    """A measured motion of a robot whose `states` are given with their units, positions first.
 
-
-def read_measured(path: Path, n: int) -> Measured:
-    """A measured motion of a robot with `n` states.
+    Rows of zeros at the end (a recording that was stopped early) and rows that repeat a time are left out. `choices`
+    are those of `--columns`, NAME=COLUMN each. The motion begins at the file's time `start` [s], which becomes 0.
 
     Raises:
-        UserError: no such file, a column that is missing, no samples, a value that is no finite number (with its
-            line), or times that do not rise.
+        UserError: no such file, a column that is missing or there twice, no samples, a value that is no finite number
+            (with its line), or times that fall.
     """
-    needed = columns_of(n)
-    lines = _lines(path)
-    head = [name.strip() for name in lines[0]]
-    missing = [name for name in needed if name not in head]
-    if missing:
-        valid = ",".join([*needed, *TORQUES.get(n // 2, [])])
-        raise UserError(f"{path} lacks the column{'s'[: len(missing) > 1]} {', '.join(missing)}: must have {valid}")
-    rows = [(number, line) for number, line in enumerate(lines[1:], 2) if line]
-    if not rows:
-        raise UserError(f"{path} has no samples: only its first line, the columns")
-    places = [head.index(name) for name in needed]
-    numbers = np.array([[_number(path, line, row, place, head) for place in places] for line, row in rows])
-    time, x = numbers[:, 0], numbers[:, 1:]
-    late = np.flatnonzero(np.diff(time) <= 0)
-    if late.size:
-        first, (line, _) = late[0], rows[late[0] + 1]
-        raise UserError(f"{path}, line {line}: time = {time[first + 1]:g} after {time[first]:g}: must rise")
-    return Measured(tuple(needed), time, x)
+    table = read_table(path, WHAT)
+    columns = find_columns(table, {"time": "s", **states}, choices)
+    lines, rows = _samples(table, columns)
+    notes = []
+    if zeros := _zeros_at_the_end(rows):
+        rows = rows[:-zeros]
+        notes.append(f"{zeros} rows of zeros at the end left out")
+    falls = np.flatnonzero(np.diff(rows[:, 0]) < 0)
+    if falls.size:
+        k = falls[0] + 1
+        raise UserError(f"{path}, line {lines[k]}: time = {rows[k, 0]:g} after {rows[k - 1, 0]:g}: must not fall")
+    repeated = np.diff(rows[:, 0], prepend=-np.inf) == 0
+    if repeated.any():
+        rows = rows[~repeated]
+        notes.append(f"{repeated.sum()} rows with the time of the row above left out")
+    if start is not None:
+        early = rows[:, 0] < start
+        if early.all():
+            raise UserError(f"--start = {start:g}: {path} ends before that, at {rows[-1, 0]:g} s")
+        rows = rows[~early] - [start, *[0.0] * len(states)]
+        notes.append(f"the motion begins at {start:g} s of the file; {early.sum()} rows before that left out")
+    return Measured(columns, rows[:, 0], rows[:, 1:], tuple(notes))
 
 
-def jumps(measured: Measured, units: Sequence[str]) -> list[str]:
+def unwrapped(measured: Measured, states: Mapping[str, str], first: Float[np.ndarray, " n"]) -> Measured:
+    """The motion with angles that do not jump by turns, and begin within half a turn of the state `first`."""
+    x, notes = measured.x.copy(), list(measured.notes)
+    for i, name in _angles(states):
+        x[:, i] = np.unwrap(x[:, i])
+        x[:, i] -= 2 * np.pi * np.round((x[0, i] - first[i]) / (2 * np.pi))
+        turned = np.abs(x[:, i] - measured.x[:, i]) > np.pi
+        notes.append(f"{name} unwrapped: whole turns added to {turned.sum()} of {len(x)} samples")
+    return replace(measured, x=x, notes=tuple(notes))
+
+
+def jumps(measured: Measured, states: Mapping[str, str]) -> list[str]:
     """What looks like an angle that was wrapped: half a turn or more between two samples."""
     found = []
-    for i, unit in enumerate(units[: len(units) // 2]):
+    for i, name in _angles(states):
         steps = np.abs(np.diff(measured.x[:, i]))
-        if unit == "rad" and steps.size and steps.max() >= np.pi:
+        if steps.size and steps.max() >= np.pi:
             k = int(steps.argmax())
             found.append(
-                f"{measured.columns[1 + i]} jumps by {steps[k]:.3g} rad at t = {measured.time[k + 1]:.4g} s: if the "
-                "encoder wraps, unwrap it first, since errors of angles are not wrapped here"
+                f"{name} jumps by {steps[k]:.3g} rad at t = {measured.time[k + 1]:.4g} s: if the encoder wraps, give "
+                "--unwrap, since errors of angles are not wrapped here"
             )
     return found
 
 
-def _lines(path: Path) -> list[list[str]]:
-    if not path.is_file():
-        raise UserError(f"{path}: no such file; must be a CSV of measured states")
-    try:
-        lines = list(csv.reader(path.read_text(encoding="utf-8-sig").splitlines()))
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise UserError(f"cannot read {path}: {error}") from error
-    if not lines:
-        raise UserError(f"{path} is empty: must begin with the columns' names")
-    return lines
+def _angles(states: Mapping[str, str]) -> list[tuple[int, str]]:
+    return [(i, name) for i, (name, unit) in enumerate(states.items()) if unit == "rad"]
 
 
-def _number(path: Path, line: int, row: Sequence[str], place: int, head: Sequence[str]) -> float:
-    text = row[place].strip() if place < len(row) else ""
+def _samples(table: Table, columns: Mapping[str, Column]) -> tuple[list[int], np.ndarray]:
+    """The numbers [T 1+n] of the columns in SI units, and their lines."""
+    width = math.inf if all(column.numbered for column in columns.values()) else len(table.headings)
+    lines, numbers = [], []
+    for line, cells in table.rows:
+        if len(cells) > width and any(cells[int(width) :]):
+            raise UserError(
+                f"{table.path}, line {line} has {len(cells)} cells under {width} column names: choose all columns by "
+                f"number, --columns {' '.join(f'{name}={k}' for k, name in enumerate(columns, 1))} perhaps"
+            )
+        lines.append(line)
+        numbers.append([_number(table, line, cells, column) for column in columns.values()])
+    if not numbers:
+        raise UserError(f"{table.path} has no samples, only its columns: {listed(table.headings)}")
+    return lines, np.array(numbers) * [column.scale for column in columns.values()]
+
+
+def _number(table: Table, line: int, cells: Sequence[str], column: Column) -> float:
+    cell = cells[column.place] if column.place < len(cells) else ""
     try:
-        value = float(text)
+        value = number_in(cell)
     except ValueError:
-        value = np.nan
-    if not np.isfinite(value):
-        raise UserError(f"{path}, line {line}: {head[place]} = {text!r}: must be a finite number")
+        value = math.nan
+    if not abs(value) <= LARGEST:
+        raise UserError(
+            f"{table.path}, line {line}: {printable(column.heading, 40)} = {shown(cell)}: must be a finite number, of "
+            f"at most {LARGEST:g} in size"
+        )
     return value
+
+
+def _zeros_at_the_end(rows: np.ndarray) -> int:
+    """How many rows of zeros stand below a time that is later than 0."""
+    filled = np.flatnonzero(rows.any(axis=1))
+    return len(rows) - 1 - int(filled[-1]) if filled.size and rows[filled[-1], 0] > 0 else 0

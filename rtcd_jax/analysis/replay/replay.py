@@ -1,8 +1,12 @@
-"""`rtcd replay`: was a measured run inside the funnel? V/rho of every sample, by the funnel of `tube.py`."""
+"""`rtcd replay`: was a measured motion inside the funnel? V/rho of every sample, and how much of the motion they cover.
+
+A stretch between two samples is covered if it is no longer than the nominal's interval at that time: nobody knows what
+happened in a longer one.
+"""
 
 import csv
 import io
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol, final
@@ -10,19 +14,23 @@ from typing import Any, Protocol, final
 import numpy as np
 from jaxtyping import Bool, Float
 
-from rtcd_jax.analysis.replay.measured import Measured, jumps, read_measured
+from rtcd_jax.analysis.replay.measured import Measured, jumps, read_measured, unwrapped
 from rtcd_jax.analysis.report.canvas import BLACK, GRAY, LIGHT, WIDTH, blank, written
 from rtcd_jax.analysis.report.funnels import draw_shadows, frame, told_once, window
-from rtcd_jax.analysis.report.reading import BLUE, VERMILION, Shown
+from rtcd_jax.analysis.report.reading import BLUE, VERMILION, FunnelView
 from rtcd_jax.analysis.report.shapes import planes
 from rtcd_jax.config.load import Config
-from rtcd_jax.elite.funnel import Tube
-from rtcd_jax.elite.records import read_config, read_elite, require_elites
+from rtcd_jax.elite.elite import Elite
+from rtcd_jax.elite.funnel import FunnelInterpolant
+from rtcd_jax.elite.records import elite_name, read_config
 from rtcd_jax.system.errors import UserError
 from rtcd_jax.system.files import make_folder, replace, replace_json
 
 LEAST = 1e-4
 """V/rho that the figure still tells from zero."""
+LEAST_SAMPLES = 2
+EVEN = 1e-6
+"""Share of an interval by which samples as far apart as knots may miss it."""
 
 
 class Console(Protocol):
@@ -35,61 +43,87 @@ class Replay:
     """A measured motion with V/rho of every sample; inside means at most 1."""
 
     measured: Measured
-    fill: Float[np.ndarray, " T"]
-    elite: str
-    record: Mapping[str, Any]
+    ratio: Float[np.ndarray, " T"]
+    name: str
+    elite: Elite
 
     @property
     def inside(self) -> Bool[np.ndarray, " T"]:
-        return self.fill <= 1
+        return self.ratio <= 1
 
     @property
     def kept(self) -> bool:
         return bool(self.inside.all())
 
+    @property
+    def covered(self) -> float:
+        """Time of the nominal motion [s] that lies between samples no farther apart than its knots."""
+        time, knots = self.measured.time, self.elite.time
+        at = np.clip(np.searchsorted(knots, time[:-1], side="right") - 1, 0, len(knots) - 2)
+        near = np.diff(time) <= (1 + EVEN) * np.diff(knots)[at]
+        return float(np.diff(np.clip(time, 0, knots[-1]))[near].sum())
+
+    @property
+    def complete(self) -> bool:
+        """Whether all of the nominal motion is covered, but for an interval at most."""
+        return self.elite.time[-1] - self.covered <= (1 + EVEN) * np.diff(self.elite.time).max()
+
     def sample(self, k: int) -> dict[str, Any]:
         """One sample as JSON stores it."""
-        state = dict(zip(self.measured.columns[1:], self.measured.x[k], strict=True))
-        return {"time": self.measured.time[k], "V/rho": self.fill[k], "state": state}
+        state = dict(zip(self.measured.states, self.measured.x[k], strict=True))
+        return {"time": self.measured.time[k], "V/rho": self.ratio[k], "state": state}
 
-    def told(self) -> dict[str, Any]:
+    def as_record(self) -> dict[str, Any]:
         """As JSON stores it: `closest` is the sample with the smallest margin 1 - V/rho."""
         first = None if self.kept else self.sample(int(np.argmin(self.inside)))
         return {
-            "elite": self.elite,
-            "samples": len(self.fill),
+            "elite": self.name,
+            "columns": {name: column.heading for name, column in self.measured.columns.items()},
+            "samples": len(self.ratio),
             "inside": self.kept,
             "share_inside": float(self.inside.mean()),
+            "covered": self.covered,
+            "share_covered": self.covered / float(self.elite.time[-1]),
             "first_exit": first,
-            "closest": self.sample(int(self.fill.argmax())),
-            "smallest_margin": 1 - float(self.fill.max()),
-            "rung": self.record["rung"],
-            "config_hash": self.record.get("config_hash"),
+            "closest": self.sample(int(self.ratio.argmax())),
+            "smallest_margin": 1 - float(self.ratio.max()),
+            "rung": self.elite.guarantee,
+            "config_hash": self.elite.record.get("config_hash"),
         }
 
 
-def replay_run(folder: Path, file: Path, elite: int | str, console: Console) -> bool:
-    """Replays a measured file against the funnel of an elite, or of the candidate "initial"; True if it stayed inside.
+def replay_run(
+    folder: Path,
+    file: Path,
+    which: int | str,
+    console: Console,
+    columns: Sequence[str] = (),
+    start: float | None = None,
+    unwrap: bool = False,
+) -> bool:
+    """Replays a measured file against the funnel of an elite, or of "initial"; False if a sample was outside.
 
-    Writes `replay/NAME_ELITE.csv`, `.json`, `.png` and `.pdf`, NAME that of the measured file.
+    Writes `replay/NAME_ELITE.csv`, `.json`, `.png` and `.pdf`, NAME that of the measured file. `columns` and `start`
+    are those of `read_measured`; `unwrap` takes whole turns out of the angles.
 
     Raises:
         UserError: no run folder, no such elite, a file that is no measured motion, or a folder that cannot be written.
     """
     config = read_config(folder)
-    name, place = (f"{elite:03d}", folder / "elites") if isinstance(elite, int) else (elite, folder)
-    require_elites(folder)
-    arrays, record = read_elite(place, name)
-    tube = Tube.of(arrays, record)
-    measured = read_measured(file, arrays["x"].shape[1])
-    _check_time(file, measured, float(tube.elite.time[-1]))
-    replay = Replay(measured, tube.fill(measured.time, measured.x), name, record)
+    name, elite = elite_name(which), Elite.read(folder, which)
+    states, funnel = config.plant.states, FunnelInterpolant.of(elite)
+    measured = read_measured(file, states, columns, start)
+    _check_time(file, measured, float(elite.time[-1]))
+    if unwrap:
+        measured = unwrapped(measured, states, funnel.nominal(measured.time[:1])[0])
+    replay = Replay(measured, funnel.ratio(measured.time, measured.x), name, elite)
     results, stem = folder / "replay", f"{file.stem}_{name}"
     make_folder(results)
     replace(results / f"{stem}.csv", _table(replay).encode())
-    replace_json(results / f"{stem}.json", {"file": str(file), **replay.told()})
-    _draw(config, Shown.of(f"funnel of {name}", VERMILION, arrays, record), replay, results, stem)
-    for line in [*jumps(measured, list(config.plant.states.values())), *_summary(replay)]:
+    replace_json(results / f"{stem}.json", {"file": str(file), **replay.as_record()})
+    _draw(config, FunnelView(f"funnel of {name}", VERMILION, elite), replay, results, stem)
+    taken = ", ".join(f"{state} from {column}" for state, column in measured.columns.items())
+    for line in [f"columns: {taken}", *measured.notes, *jumps(measured, states), *_summary(replay)]:
         console.message(line)
     console.message(f"V/rho of every sample, and its figure: {results / stem}.csv, .json, .png, .pdf")
     return replay.kept
@@ -99,19 +133,31 @@ def _check_time(file: Path, measured: Measured, end: float) -> None:
     first = float(measured.time[0])
     if not 0 <= first < end:
         raise UserError(
-            f"{file}: time begins at {first:g} s: must begin in [0, {end:.4g}), the motion's time; t = 0 is its start"
+            f"{file}: time begins at {first:g} s: must begin in [0, {end:.4g}), the motion's time; t = 0 is its start, "
+            "--start T says at which time of the file that is"
+        )
+    samples = int(np.sum(measured.time <= end))
+    if samples < LEAST_SAMPLES:
+        raise UserError(
+            f"{file} has {samples} sample of the motion, which takes {end:.4g} s: must have {LEAST_SAMPLES} at least"
         )
 
 
 def _summary(replay: Replay) -> list[str]:
-    told, time = replay.told(), replay.measured.time
-    whose = f"the funnel of {told['elite']} ({told['rung']})"
-    lines = [f"{told['samples']} samples, t = {time[0]:.4g} to {time[-1]:.4g} s, {whose}"]
+    record, time, end = replay.as_record(), replay.measured.time, float(replay.elite.time[-1])
+    lines = [
+        f"{record['samples']} samples, t = {time[0]:.4g} to {time[-1]:.4g} s, of the motion's {end:.4g} s they cover "
+        f"{record['share_covered']:.1%}; the funnel of {record['elite']} ({record['rung']})"
+    ]
     if replay.kept:
-        lines.append(f"inside the funnel all the way; smallest margin 1 - V/rho = {told['smallest_margin']:.3g}")
-        return [*lines, f"closest to its boundary {_at(told['closest'])}"]
-    lines.append(f"OUTSIDE the funnel, first {_at(told['first_exit'])}")
-    return [*lines, f"farthest outside {_at(told['closest'])}; {told['share_inside']:.1%} of the samples inside"]
+        whole = f"inside the funnel {'all the way' if replay.complete else 'at every sample'}"
+        lines.append(f"{whole}; smallest margin 1 - V/rho = {record['smallest_margin']:.3g}")
+        lines.append(f"closest to its boundary {_at(record['closest'])}")
+        if not replay.complete:
+            lines.append(f"nothing is known of the other {1 - record['share_covered']:.1%} of the motion")
+        return lines
+    lines.append(f"OUTSIDE the funnel, first {_at(record['first_exit'])}")
+    return [*lines, f"farthest outside {_at(record['closest'])}; {record['share_inside']:.1%} of the samples inside"]
 
 
 def _at(sample: Mapping[str, Any]) -> str:
@@ -123,16 +169,16 @@ def _table(replay: Replay) -> str:
     """The samples with V/rho and 1 where inside."""
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
-    writer.writerow([*replay.measured.columns, "V/rho", "inside"])
-    rows = np.column_stack([replay.measured.time, replay.measured.x, replay.fill]).tolist()
+    writer.writerow(["time", *replay.measured.states, "V/rho", "inside"])
+    rows = np.column_stack([replay.measured.time, replay.measured.x, replay.ratio]).tolist()
     writer.writerows([*map(repr, row), int(row[-1] <= 1)] for row in rows)
     return text.getvalue()
 
 
-def _draw(config: Config, funnel: Shown, replay: Replay, folder: Path, name: str) -> None:
+def _draw(config: Config, funnel: FunnelView, replay: Replay, folder: Path, name: str) -> None:
     pairs = planes(replay.measured.x.shape[1])
     with blank((WIDTH, 3.2 * len(pairs) + 2.2)) as figure:
-        *panels, fill = figure.subplots(len(pairs) + 1, 1, height_ratios=[3.2] * len(pairs) + [2.2])
+        *panels, ratio = figure.subplots(len(pairs) + 1, 1, height_ratios=[3.2] * len(pairs) + [2.2])
         for axes, plane in zip(panels, pairs, strict=True):
             draw_shadows(axes, [funnel], plane)
             motion = replay.measured.x[:, plane]
@@ -142,9 +188,9 @@ def _draw(config: Config, funnel: Shown, replay: Replay, folder: Path, name: str
             view = np.stack([np.minimum(low, motion.min(0)), np.maximum(high, motion.max(0))])
             frame(axes, config, plane, view)
         figure.legend(**told_once(panels), loc="outside upper center")
-        fill.semilogy(replay.measured.time, np.maximum(replay.fill, LEAST), color=BLUE)
-        fill.axhline(1, color=BLACK, lw=1, ls="--")
-        fill.axvline(float(funnel.time[-1]), color=GRAY, lw=1, ls=":")
-        fill.set(xlabel="time [s]", ylabel="V/ρ [-]")
-        fill.grid(axis="y", lw=0.4, color=LIGHT)
+        ratio.semilogy(replay.measured.time, np.maximum(replay.ratio, LEAST), color=BLUE)
+        ratio.axhline(1, color=BLACK, lw=1, ls="--")
+        ratio.axvline(float(funnel.elite.time[-1]), color=GRAY, lw=1, ls=":")
+        ratio.set(xlabel="time [s]", ylabel="V/ρ [-]")
+        ratio.grid(axis="y", lw=0.4, color=LIGHT)
         written(figure, folder, name)

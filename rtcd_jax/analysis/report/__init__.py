@@ -4,8 +4,6 @@ reading.py, history.py     the folder's content, and the course of its search
 funnels.py, progress.py    figures/NAME.png and .pdf
 plots.py, tables.py        what the page shows
 page.py                    report.html
-tube.py, replay.py         was a measured motion inside the funnel?
-render.py, animate.py      the swing-up before MuJoCo's camera
 """
 
 from rtcd_jax.analysis.report.page import refresh, report

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from rtcd_jax.analysis.report.canvas import BLACK, GRAY, LIGHT, SMALL, WIDTH, blank, written
-from rtcd_jax.analysis.report.reading import Run, Shown, shown
+from rtcd_jax.analysis.report.reading import FunnelView, Run, shown
 from rtcd_jax.analysis.report.shapes import outlines, planes, projections
 from rtcd_jax.analysis.report.words import VOLUMES, listed, quantity, rung, volume_unit, words
 from rtcd_jax.config.load import Config
@@ -41,8 +41,9 @@ def draw_levels(run: Run) -> list[Path]:
     with blank((WIDTH, 4.6)) as figure:
         levels, volumes = figure.subplots(2, 1, sharex=True)
         for funnel in run.funnels:
-            levels.semilogy(funnel.time, funnel.rho, ".-", ms=4, color=funnel.color, label=funnel.label)
-            volumes.semilogy(funnel.time, funnel.per_knot, ".-", ms=4, color=funnel.color, label=funnel.label)
+            elite = funnel.elite
+            for axes, values in ((levels, elite.rho), (volumes, elite.volumes_per_knot)):
+                axes.semilogy(elite.time, values, ".-", ms=4, color=funnel.color, label=funnel.label)
         levels.set_ylabel("level ρ of V [-]")
         volumes.set(xlabel="time [s]", ylabel=f"volume [{volume_unit(run.config)}]")
         for axes in (levels, volumes):
@@ -64,7 +65,8 @@ def draw_over(runs: Sequence[Run], folder: Path, name: str) -> list[Path]:
             frame(axes, config, plane, window(funnels, plane))
         figure.legend(**told_once(panels), loc="outside upper center")
         for funnel in funnels:
-            volumes.semilogy(funnel.time, funnel.per_knot, color=funnel.color, label=_told_briefly(funnel))
+            time, values = funnel.elite.time, funnel.elite.volumes_per_knot
+            volumes.semilogy(time, values, color=funnel.color, label=_told_briefly(funnel))
         volumes.set(xlabel="time [s]", ylabel=f"volume of a knot's\nellipsoid [{volume_unit(config)}]")
         volumes.grid(axis="y", lw=0.4, color=LIGHT)
         units = f"volumes in {volume_unit(config)}, integrals in {volume_unit(config, 'integral')}"
@@ -72,14 +74,14 @@ def draw_over(runs: Sequence[Run], folder: Path, name: str) -> list[Path]:
         return written(figure, folder, name)
 
 
-def draw_shadows(axes: "Axes", funnels: Sequence[Shown], plane: tuple[int, int]) -> None:
+def draw_shadows(axes: "Axes", funnels: Sequence[FunnelView], plane: tuple[int, int]) -> None:
     """Funnels in their own colors over one another, the one that reaches farthest lowest."""
     from matplotlib.collections import PolyCollection
     from matplotlib.colors import to_rgba
     from matplotlib.patches import PathPatch
     from matplotlib.path import Path as Curve
 
-    for funnel in sorted(funnels, key=lambda funnel: -float(funnel.per_knot.max())):
+    for funnel in sorted(funnels, key=lambda funnel: -float(funnel.elite.volumes_per_knot.max())):
         curves = list(shadow(funnel, plane))
         # One curve of all ellipses is filled once: their shades do not add up where they overlap.
         whole = Curve.make_compound_path(*map(Curve, curves))
@@ -88,16 +90,18 @@ def draw_shadows(axes: "Axes", funnels: Sequence[Shown], plane: tuple[int, int])
         edges = to_rgba(funnel.color, 0.45)
         width = 0.5 if len(curves) <= MANY else 0.25
         axes.add_collection(PolyCollection(curves, facecolors="none", edgecolors=edges, lw=width))
-        axes.plot(*funnel.x[:, plane].T, color=funnel.color, label=funnel.label, zorder=3)
+        axes.plot(*funnel.elite.x[:, plane].T, color=funnel.color, label=funnel.label, zorder=3)
 
 
-def shadow(funnel: Shown, plane: tuple[int, int], points: int | None = None) -> Float[np.ndarray, "knots points 2"]:
+def shadow(
+    funnel: FunnelView, plane: tuple[int, int], points: int | None = None
+) -> Float[np.ndarray, "knots points 2"]:
     """Outlines of a funnel's ellipsoids in a plane."""
-    points = points or (181 if len(funnel.time) <= MANY else 91)
-    return outlines(funnel.x[:, plane], projections(funnel.S, funnel.rho, plane), points)
+    points = points or (181 if len(funnel.elite.time) <= MANY else 91)
+    return outlines(funnel.elite.x[:, plane], projections(funnel.elite.S, funnel.elite.rho, plane), points)
 
 
-def window(funnels: Sequence[Shown], plane: tuple[int, int]) -> Float[np.ndarray, "2 2"]:
+def window(funnels: Sequence[FunnelView], plane: tuple[int, int]) -> Float[np.ndarray, "2 2"]:
     """Lower and upper corner of a plane's window: all funnels with a margin."""
     points = np.concatenate([shadow(funnel, plane).reshape(-1, 2) for funnel in funnels])
     low, high = points.min(0), points.max(0)
@@ -122,7 +126,7 @@ def frame(axes: "Axes", config: Config, plane: tuple[int, int], view: Float[np.n
 def _beside(figure: "Figure", run: Run) -> None:
     config, funnels, pairs = run.config, run.funnels, planes(run.best.x.shape[1])
     grid = figure.add_gridspec(len(pairs) + 1, len(funnels), height_ratios=[2.9] * len(pairs) + [2.0])
-    colors = _time_colors(max(float(funnel.time[-1]) for funnel in funnels))
+    colors = _time_colors(max(float(funnel.elite.time[-1]) for funnel in funnels))
     panels = []
     for row, plane in enumerate(pairs):
         view = window(funnels, plane)
@@ -159,13 +163,13 @@ def _time_colors(duration: float) -> "ScalarMappable":
     return ScalarMappable(Normalize(0, duration), shades)
 
 
-def _draw_in_time(axes: "Axes", funnel: Shown, plane: tuple[int, int], colors: "ScalarMappable") -> None:
+def _draw_in_time(axes: "Axes", funnel: FunnelView, plane: tuple[int, int], colors: "ScalarMappable") -> None:
     from matplotlib.collections import PolyCollection
 
-    shades = colors.to_rgba(funnel.time)
+    shades = colors.to_rgba(funnel.elite.time)
     faces = shades * np.array([1, 1, 1, 0.05])
     axes.add_collection(PolyCollection(list(shadow(funnel, plane)), facecolors=faces, edgecolors=shades, lw=0.6))
-    axes.plot(*funnel.x[:, plane].T, color=BLACK, label="nominal motion")
+    axes.plot(*funnel.elite.x[:, plane].T, color=BLACK, label="nominal motion")
 
 
 def _draw_limits(axes: "Axes", limits: Sequence[float], view: np.ndarray) -> None:
@@ -176,31 +180,32 @@ def _draw_limits(axes: "Axes", limits: Sequence[float], view: np.ndarray) -> Non
                 lines(value, color=GRAY, ls="--", lw=1, label="state limit")
 
 
-def _draw_volumes(axes: "Axes", config: Config, funnels: Sequence[Shown]) -> None:
+def _draw_volumes(axes: "Axes", config: Config, funnels: Sequence[FunnelView]) -> None:
     for funnel in funnels:
-        axes.semilogy(funnel.time, funnel.per_knot, ".-", ms=4, color=funnel.color, label=_told(config, funnel))
+        time, values = funnel.elite.time, funnel.elite.volumes_per_knot
+        axes.semilogy(time, values, ".-", ms=4, color=funnel.color, label=_told(config, funnel))
     axes.set(xlabel="time [s]", ylabel=f"volume of a knot's\nellipsoid [{volume_unit(config)}]")
     axes.grid(axis="y", lw=0.4, color=LIGHT)
     if len(funnels) == 2:
         first, second = funnels
-        ratios = [f"{words(name)} × {second.volumes[name] / first.volumes[name]:.3g}" for name in VOLUMES]
+        ratios = [f"{words(name)} × {second.elite.volumes[name] / first.elite.volumes[name]:.3g}" for name in VOLUMES]
         axes.set_title(f"{second.label} over {first.label}: {', '.join(ratios)}")
 
 
-def _told(config: Config, funnel: Shown) -> str:
+def _told(config: Config, funnel: FunnelView) -> str:
     """The four volumes with their rung, which no volume is told without."""
-    told = [f"{words(name)} {funnel.volumes[name]:.4g} {volume_unit(config, name)}" for name in VOLUMES]
-    return f"{funnel.label}: {', '.join(told)}\n{rung(funnel.record)}"
+    told = [f"{words(name)} {funnel.elite.volumes[name]:.4g} {volume_unit(config, name)}" for name in VOLUMES]
+    return f"{funnel.label}: {', '.join(told)}\n{rung(funnel.elite.record)}"
 
 
-def _told_briefly(funnel: Shown) -> str:
-    told = [f"{words(name)} {funnel.volumes[name]:.3g}" for name in VOLUMES]
-    promise = f", ε = {funnel.record['epsilon']:.2g}" if funnel.record["rung"] == "sampled" else ""
-    return f"{funnel.label}: {', '.join(told)} ({funnel.record['rung']}{promise})"
+def _told_briefly(funnel: FunnelView) -> str:
+    told = [f"{words(name)} {funnel.elite.volumes[name]:.3g}" for name in VOLUMES]
+    promise = f", ε = {funnel.elite.epsilon:.2g}" if funnel.elite.guarantee == "sampled" else ""
+    return f"{funnel.label}: {', '.join(told)} ({funnel.elite.guarantee}{promise})"
 
 
-def _title(config: Config, funnel: Shown) -> str:
-    record: Mapping[str, Any] = funnel.record
+def _title(config: Config, funnel: FunnelView) -> str:
+    record: Mapping[str, Any] = funnel.elite.record
     design = [listed(name, value, config.plant.design[name]) for name, value in record["design"].items()]
     weights = [listed(name, value) for name, value in record["weights"].items()]
     return "\n".join([funnel.label, ", ".join(design), ", ".join(weights)])

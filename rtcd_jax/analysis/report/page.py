@@ -20,6 +20,7 @@ from rtcd_jax.analysis.report.progress import draw_convergence, draw_courses
 from rtcd_jax.analysis.report.reading import Experiment, Run, compared, read_run
 from rtcd_jax.analysis.report.tables import Cell, Table
 from rtcd_jax.analysis.report.words import NONE, duration, listed, ratio, rung, words
+from rtcd_jax.system.console import Console
 from rtcd_jax.system.errors import UserError
 from rtcd_jax.system.files import replace
 
@@ -31,8 +32,10 @@ LONGEST = 40
 _NUMBER, _LONG = ' class="number"', ' class="long"'
 
 
-def report(folders: Sequence[Path], to: Path | None = None) -> list[Path]:
+def report(folders: Sequence[Path], to: Path | None = None, console: Console | None = None) -> list[Path]:
     """Writes the page of a finished run, or one that compares several, and its figures; the page's path first.
+
+    Certificates that were not checked yet are checked first, and `console` told how far that is.
 
     One run: `report.html` and `figures/` in its folder. Several: `comparison.html` beside the first folder, with
     `comparison.png` and `.pdf`. `to`, say NAME.html, is another path for the page; then one run's figures are in
@@ -41,7 +44,7 @@ def report(folders: Sequence[Path], to: Path | None = None) -> list[Path]:
     Raises:
         UserError: a folder that is no finished run's, runs of different robots, or a path that cannot be written.
     """
-    runs = [read_run(folder) for folder in folders]
+    runs = [read_run(folder, console) for folder in folders]
     if to is not None and to.is_dir():
         raise UserError(f"--to = {to}: must be a file, and this is a folder")
     if len(runs) == 1:
@@ -55,7 +58,7 @@ def report(folders: Sequence[Path], to: Path | None = None) -> list[Path]:
     return [page, *drawn]
 
 
-def refresh(folder: Path) -> Path | None:
+def refresh(folder: Path, console: Console | None = None) -> Path | None:
     """The run's page written anew, with what was proved, verified and tried since; None where there is no page.
 
     The figures beside it show none of that, and stay. Raises UserError as `report`.
@@ -63,7 +66,7 @@ def refresh(folder: Path) -> Path | None:
     page = folder / "report.html"
     if not page.is_file():
         return None
-    replace(page, render([read_run(folder)]).encode())
+    replace(page, render([read_run(folder, console)]).encode())
     return page
 
 
@@ -100,7 +103,7 @@ def _header(runs: Sequence[Run]) -> str:
         told = f'<p class="candidate">{_candidate(runs[0])}</p>'
     else:
         cards = "".join(
-            _card(run.name, f"× {_told(_gain(run, 'sum'))}", f"sum over its initial one, {run.best.record['rung']}")
+            _card(run.name, f"× {_told(_gain(run, 'sum'))}", f"sum over its initial one, {run.best.guarantee}")
             for run in runs
         )
         told = ""
@@ -122,10 +125,15 @@ def _headlines(run: Run) -> Iterator[tuple[str, str, str]]:
     objective = run.config.search.objective
     for name in dict.fromkeys((objective, "sum", "inlet")):
         searched = ", searched" if name == objective else ""
-        yield f"{words(name)} over initial", f"× {_told(_gain(run, name))}", run.best.record["rung"] + searched
+        yield f"{words(name)} over initial", f"× {_told(_gain(run, name))}", run.best.guarantee + searched
     yield "swing-up", duration(float(run.best.time[-1])), "of the best, start to goal"
     found = run.certificates.get("000")
-    yield "proof", found["rung"] if found else "none yet", "of the best's funnel" if found else "rtcd certify"
+    if found is None:
+        yield "proof", "none yet", "rtcd certify"
+    elif found.guarantee is None:
+        yield "proof", "none", f"certificate {found.verdict}"
+    else:
+        yield "proof", found.guarantee, "of the best's funnel"
     kept = [seen.get("kept") for seen in run.verification.values()]
     seen = ("promises kept" if all(kept) else "PROMISE BROKEN") if kept else "none yet"
     yield "verification", seen, "by independent simulators" if kept else "rtcd verify"

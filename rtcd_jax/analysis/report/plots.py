@@ -9,7 +9,7 @@ from rtcd_jax.analysis.report.canvas import BLACK, GRAY
 from rtcd_jax.analysis.report.funnels import MANY, shadow, window
 from rtcd_jax.analysis.report.history import Course, column, courses, failures, spread
 from rtcd_jax.analysis.report.progress import GREEN, SPREAD, STATUS_COLORS, told_status
-from rtcd_jax.analysis.report.reading import BLUE, VERMILION, Run, Shown, shown
+from rtcd_jax.analysis.report.reading import BLUE, VERMILION, FunnelView, Run, shown
 from rtcd_jax.analysis.report.shapes import planes
 from rtcd_jax.analysis.report.words import letter, volume_unit, words
 from rtcd_jax.config.load import Config
@@ -37,9 +37,9 @@ def plots(runs: Sequence[Run]) -> dict[str, Plot]:
     return found
 
 
-def plane_plot(config: Config, funnels: Sequence[Shown], plane: tuple[int, int]) -> Plot:
+def plane_plot(config: Config, funnels: Sequence[FunnelView], plane: tuple[int, int]) -> Plot:
     """Funnels over one another; `moments` says which traces the time slider fills from which."""
-    lowest_first = sorted(funnels, key=lambda funnel: -float(funnel.per_knot.max()))
+    lowest_first = sorted(funnels, key=lambda funnel: -float(funnel.elite.volumes_per_knot.max()))
     bodies = [_body(funnel, plane) for funnel in lowest_first]
     motions = [_motion(config, funnel, plane) for funnel in lowest_first]
     moments = [_outline(funnel) for funnel in lowest_first]
@@ -55,20 +55,21 @@ def plane_plot(config: Config, funnels: Sequence[Shown], plane: tuple[int, int])
             "shapes": _limits(config, plane, view),
         },
         "moments": [
-            {"source": i, "trace": 2 * count + i, "times": _numbers(funnel.time), "points": POINTS + 1}
+            {"source": i, "trace": 2 * count + i, "times": _numbers(funnel.elite.time), "points": POINTS + 1}
             for i, funnel in enumerate(lowest_first)
         ],
     }
 
 
-def levels_plot(config: Config, funnels: Sequence[Shown]) -> Plot:
+def levels_plot(config: Config, funnels: Sequence[FunnelView]) -> Plot:
     """rho and the volume of every knot over time."""
     data = []
-    for axis, values in (("y2", lambda funnel: funnel.rho), ("y", lambda funnel: funnel.per_knot)):
+    for axis, values in (("y2", lambda elite: elite.rho), ("y", lambda elite: elite.volumes_per_knot)):
         for funnel in funnels:
             told = {"name": funnel.label, "legendgroup": funnel.label, "showlegend": axis == "y2"}
-            line = {"x": _numbers(funnel.time), "y": _numbers(values(funnel)), "yaxis": axis, "mode": "lines+markers"}
-            data.append(told | line | {"line": {"color": funnel.color}, "marker": {"size": 3}})
+            line = {"x": _numbers(funnel.elite.time), "y": _numbers(values(funnel.elite)), "yaxis": axis}
+            look = {"mode": "lines+markers", "line": {"color": funnel.color}, "marker": {"size": 3}}
+            data.append(told | line | look)
     return {
         "data": data,
         "layout": {
@@ -117,7 +118,7 @@ def progress_plot(runs: Sequence[Run]) -> Plot:
             first, values = name == "best_so_far", column(run.generations, name)
             told = legend if first else f"{run.name}, {words(name)}"
             group = {"legendgroup": run.name, "showlegend": first, "yaxis": axis}
-            data.append(_line(evaluated, values, told, run.best.color, dash, width) | group)
+            data.append(_line(evaluated, values, told, run.color, dash, width) | group)
             volumes += [values] * (axis == "y")
     scale = _scale(np.concatenate(volumes))
     return {
@@ -159,7 +160,7 @@ def _scale(values: np.ndarray) -> Mapping[str, str]:
     return _LOG if np.nanmax(values) > 10 * np.nanmin(values) > 0 else {}
 
 
-def _body(funnel: Shown, plane: tuple[int, int]) -> Plot:
+def _body(funnel: FunnelView, plane: tuple[int, int]) -> Plot:
     """All ellipses as one trace, a gap behind each."""
     curves = shadow(funnel, plane, POINTS)
     gaps = np.full((len(curves), 1, 2), np.nan)
@@ -170,7 +171,7 @@ def _body(funnel: Shown, plane: tuple[int, int]) -> Plot:
         "mode": "lines",
         "fill": "toself",
         "fillcolor": _faint(funnel.color, 0.10),
-        "line": {"color": _faint(funnel.color, 0.45), "width": 0.6 if len(funnel.time) <= MANY else 0.3},
+        "line": {"color": _faint(funnel.color, 0.45), "width": 0.6 if len(funnel.elite.time) <= MANY else 0.3},
         "name": funnel.label,
         "legendgroup": funnel.label,
         "showlegend": False,
@@ -178,19 +179,22 @@ def _body(funnel: Shown, plane: tuple[int, int]) -> Plot:
     }
 
 
-def _motion(config: Config, funnel: Shown, plane: tuple[int, int]) -> Plot:
+def _motion(config: Config, funnel: FunnelView, plane: tuple[int, int]) -> Plot:
     """The nominal motion, which tells of a knot what is under the pointer."""
     unit = volume_unit(config)
-    x, y = (_rounded(funnel.x[:, i]) for i in plane)
+    x, y = (_rounded(funnel.elite.x[:, i]) for i in plane)
     return {
         "x": x,
         "y": y,
         "mode": "lines+markers",
         "line": {"color": funnel.color, "width": 1.5},
-        "marker": {"size": 4 if len(funnel.time) <= MANY else 2.5},
+        "marker": {"size": 4 if len(funnel.elite.time) <= MANY else 2.5},
         "name": funnel.label,
         "legendgroup": funnel.label,
-        "customdata": [_numbers(row) for row in np.stack([funnel.time, funnel.rho, funnel.per_knot], axis=1)],
+        "customdata": [
+            _numbers(row)
+            for row in np.stack([funnel.elite.time, funnel.elite.rho, funnel.elite.volumes_per_knot], axis=1)
+        ],
         "hovertemplate": (
             "t = %{customdata[0]:.3f} s<br>(%{x:.4g}, %{y:.4g})<br>ρ = %{customdata[1]:.3g}<br>"
             f"volume %{{customdata[2]:.3g}} {unit}<extra>{funnel.label}</extra>"
@@ -198,7 +202,7 @@ def _motion(config: Config, funnel: Shown, plane: tuple[int, int]) -> Plot:
     }
 
 
-def _outline(funnel: Shown) -> Plot:
+def _outline(funnel: FunnelView) -> Plot:
     """Where the slider draws the ellipse of its time."""
     return {
         "x": [None],

@@ -1,19 +1,29 @@
 """A finished run as reports show it: everything that its folder holds, checked once and given names."""
 
 import itertools
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, final
 
 import numpy as np
-from jaxtyping import Float
 
 from rtcd_jax.analysis.report.words import VOLUMES
+from rtcd_jax.certificate.standing import certificate_path, standing
 from rtcd_jax.config.load import Config
-from rtcd_jax.elite.records import elite_names, read_config, read_elite, read_generations, require_elites
+from rtcd_jax.elite.elite import Elite, initial_and_best
+from rtcd_jax.elite.records import (
+    INITIAL,
+    elite_folder,
+    elite_names,
+    read_config,
+    read_elite,
+    read_generations,
+)
+from rtcd_jax.system.console import Console, silent
 from rtcd_jax.system.errors import UserError
-from rtcd_jax.system.files import read_json
+from rtcd_jax.system.files import read_json, reading
 
 # Okabe and Ito's colors: told apart by all kinds of color vision.
 BLUE, VERMILION = "#0072B2", "#D55E00"
@@ -22,7 +32,7 @@ COLORS = (VERMILION, "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
 INITIALS = (BLUE, "#5F6B7A", "#8C6D31", "#7A5195")
 """Of their initial candidates, where they differ."""
 
-
+_ADVICE = "remove it, or make it again"
 _OF_A_GENERATION = (
     "index", "evaluations", "objective", "best", "median", "best_so_far", "feasible", "counts", "sigma", "restarts",
     "genomes", "volumes",
@@ -31,33 +41,12 @@ _OF_A_GENERATION = (
 
 @final
 @dataclass(frozen=True)
-class Shown:
-    """What reports tell of one funnel: arrays as in the run folder, `volumes` by name, `record` beside them.
-
-    `label` and `color` are its own in all panels.
-    """
+class FunnelView:
+    """A funnel as it is drawn; `label` and `color` are its own in all panels."""
 
     label: str
     color: str
-    time: Float[np.ndarray, " knots"]
-    x: Float[np.ndarray, "knots n"]
-    S: Float[np.ndarray, "knots n n"]
-    rho: Float[np.ndarray, " knots"]
-    per_knot: Float[np.ndarray, " knots"]
-    volumes: Mapping[str, float]
-    record: Mapping[str, Any]
-
-    @classmethod
-    def of(cls, label: str, color: str, arrays: Mapping[str, np.ndarray], record: Mapping[str, Any]) -> "Shown":
-        """A funnel from its stored arrays and record. Raises UserError if something is missing."""
-        needed = ["time", "x", "S", "rho", "volumes_per_knot", *(f"volumes_{name}" for name in VOLUMES)]
-        missing = [name for name in needed if name not in arrays]
-        missing += [name for name in ("design", "weights", "rung") if name not in record]
-        if missing:
-            raise UserError(f"the {label} candidate lacks {', '.join(missing)}")
-        volumes = {name: float(arrays[f"volumes_{name}"]) for name in VOLUMES}
-        shapes = {name: arrays[name] for name in ("time", "x", "S", "rho")}
-        return cls(label, color, **shapes, per_knot=arrays["volumes_per_knot"], volumes=volumes, record=record)
+    elite: Elite
 
 
 @final
@@ -72,30 +61,66 @@ class Experiment:
 
 @final
 @dataclass(frozen=True)
+class Certificate:
+    """What is shown of an elite's funnel, from `start` [s] on, by an effort of `seconds`, beside what was sampled.
+
+    `guarantee` is "proved" only where the checker accepts the stored file for the stored elite; it is None, and
+    `shown` empty, where the file shows nothing of this elite: `verdict` says so in a word, `reason` in a sentence.
+    """
+
+    guarantee: str | None
+    verdict: str
+    reason: str = ""
+    start: float = 0.0
+    intervals: int = 0
+    seconds: float = 0.0
+    sampled: Mapping[str, float] = field(default_factory=dict)
+    shown: Mapping[str, float] = field(default_factory=dict)
+
+
+@final
+@dataclass(frozen=True)
+class Checking:
+    """How far the checker is with a certificate, in intervals."""
+
+    file: Path
+    done: int
+    total: int
+
+    def __str__(self) -> str:
+        return f"checking {self.file}  interval {self.done}/{self.total}"
+
+
+@final
+@dataclass(frozen=True)
 class Run:
     """A run folder. `initial` is None where the initial candidate has no funnel, and `absence` says why.
 
-    `figures` is the folder that they are drawn into.
+    `figures` is the folder that they are drawn into; `labels` are those of the initial and of the best funnel, and
+    `color` is the best one's.
     """
 
     path: Path
     figures: Path
     name: str
     config: Config
-    best: Shown
-    initial: Shown | None
+    best: Elite
+    initial: Elite | None
     absence: str
     generations: Sequence[Mapping[str, Any]]
     elites: Mapping[str, Mapping[str, Any]]
-    certificates: Mapping[str, Mapping[str, Any] | None]
+    certificates: Mapping[str, Certificate]
     verification: Mapping[str, Mapping[str, Any]]
     experiments: Sequence[Experiment]
     provenance: Mapping[str, Any]
+    labels: tuple[str, str] = ("initial", "best")
+    color: str = VERMILION
 
     @property
-    def funnels(self) -> list[Shown]:
+    def funnels(self) -> list[FunnelView]:
         """The initial one, if there is one, and the best."""
-        return [self.best] if self.initial is None else [self.initial, self.best]
+        best = FunnelView(self.labels[1], self.color, self.best)
+        return [best] if self.initial is None else [FunnelView(self.labels[0], BLUE, self.initial), best]
 
     @property
     def seconds(self) -> float | None:
@@ -104,50 +129,40 @@ class Run:
         return sum(spent) if spent and None not in spent else None
 
 
-def read_run(path: Path) -> Run:
-    """Everything that a finished run left in its folder.
+def read_run(path: Path, console: Console | None = None) -> Run:
+    """Everything that a finished run left in its folder; its certificates are checked, and `console` told so.
 
     Raises:
         UserError: no run folder, no elites yet, an elite without a funnel or with something missing, or a file that
             cannot be read.
     """
-    config, best = read_config(path), read_best(path)
-    initial, absence = read_initial(path)
-    folder = path / "elites"
+    config = read_config(path)
+    funnels, absence = initial_and_best(path)
+    for name, elite in funnels.items():
+        _require_shown(name, elite)
     return Run(
         path=path,
         figures=path / "figures",
         name=path.resolve().name,
         config=config,
-        best=best,
-        initial=initial,
+        best=funnels["best"],
+        initial=funnels.get(INITIAL),
         absence=absence,
         generations=read_search(path),
-        elites={name: read_elite(folder, name)[1] for name in elite_names(path)},
-        certificates=_json(path / "certificates" / "summary.json"),
+        elites={name: read_elite(elite_folder(path, name), name)[1] for name in elite_names(path)},
+        certificates=dict(_certificates(path, console or silent())),
         verification={file.stem: _json(file) for file in sorted((path / "verification").glob("*.json"))},
         experiments=tuple(_experiments(path / "disturbance")),
         provenance=_json(path / "provenance.json"),
     )
 
 
-def read_best(path: Path) -> Shown:
-    """The best elite. Raises UserError if there is none, or it has no funnel."""
-    require_elites(path)
-    arrays, record = read_elite(path / "elites", "000")
-    if record.get("status") != "OK":
-        raise UserError(f"{path / 'elites'}: 000 has no funnel ({record.get('status')})")
-    return Shown.of("best", VERMILION, arrays, record)
-
-
-def read_initial(path: Path) -> tuple[Shown | None, str]:
-    """The initial candidate's funnel, or None and the reason."""
-    if not (path / "initial.json").is_file():
-        return None, "no initial candidate was stored"
-    arrays, record = read_elite(path, "initial")
-    if record.get("status") != "OK":
-        return None, f"the initial candidate has no funnel ({record.get('status')})"
-    return Shown.of("initial", BLUE, arrays, record), ""
+def _require_shown(name: str, elite: Elite) -> None:
+    """Raises UserError where something is missing that reports tell of a candidate."""
+    missing = [f"volumes_{volume}" for volume in VOLUMES if volume not in elite.volumes]
+    missing += [key for key in ("design", "weights") if key not in elite.record]
+    if missing:
+        raise UserError(f"the {name} candidate lacks {', '.join(missing)}")
 
 
 def read_search(path: Path) -> list[dict[str, Any]]:
@@ -175,27 +190,65 @@ def compared(runs: Sequence[Run]) -> list[Run]:
     found: list[Run] = []
     for index, run in enumerate(runs):
         name = run.name if names.count(run.name) == 1 else str(run.path)
-        best = replace(run.best, label=name, color=COLORS[index % len(COLORS)])
-        initial = run.initial and replace(run.initial, label=f"{name}, initial")
-        found.append(replace(run, name=name, best=best, initial=initial))
+        color = COLORS[index % len(COLORS)]
+        found.append(replace(run, name=name, labels=(f"{name}, initial", name), color=color))
     return found
 
 
-def shown(runs: Sequence[Run]) -> list[Shown]:
+def shown(runs: Sequence[Run]) -> list[FunnelView]:
     """The funnels that are drawn over one another: what the runs have in common, their initial candidate, once."""
-    initials: list[Shown] = []
+    initials: list[FunnelView] = []
     for run in runs:
-        if run.initial and not any(_same(run.initial, other) for other in initials):
-            initials.append(run.initial)
+        for initial in run.funnels[:-1]:
+            if not any(_same(initial.elite, other.elite) for other in initials):
+                initials.append(initial)
     if len(initials) == 1:
         initials = [replace(initials[0], label="initial")]
     colors = itertools.cycle(INITIALS)
-    return [*(replace(initial, color=next(colors)) for initial in initials), *(run.best for run in runs)]
+    return [*(replace(initial, color=next(colors)) for initial in initials), *(run.funnels[-1] for run in runs)]
 
 
-def _same(first: Shown, second: Shown) -> bool:
+def _same(first: Elite, second: Elite) -> bool:
     """Whether two funnels are one candidate's: the same motion and values, however their levels were sampled."""
     return first.x.shape == second.x.shape and np.allclose(first.x, second.x) and np.allclose(first.S, second.S)
+
+
+def _certificates(path: Path, console: Console) -> Iterator[tuple[str, Certificate]]:
+    """What `rtcd certify` left, by elite, as far as the files still bear it out."""
+    summary = path / "certificates" / "summary.json"
+    for name, written in _json(summary).items():
+        if written is None:
+            yield name, Certificate(None, "not found", "no goal region could be shown")
+            continue
+        found = standing(path, name, _telling(console, certificate_path(path, name)))
+        with reading(summary, _ADVICE):
+            told = {"seconds": float(written["seconds"]), "sampled": _numbers(written["sampled"])}
+            if found.proved:
+                shown = {"start": found.start, "intervals": found.intervals, "shown": found.volumes}
+                yield name, Certificate("proved", found.verdict, **told, **shown)
+            elif found.verdict == "refused" and written["rung"] == "certified":  # in floating-point numbers, no more
+                shown = {"start": float(written["start"]), "intervals": int(written["intervals"])}
+                shown |= {"shown": _numbers(written["found"])}
+                yield name, Certificate("certified", found.verdict, found.reason, **told, **shown)
+            else:
+                yield name, Certificate(None, found.verdict, found.reason, **told)
+
+
+def _numbers(written: Mapping[str, Any]) -> dict[str, float]:
+    return {str(key): float(value) for key, value in written.items()}
+
+
+def _telling(console: Console, file: Path) -> Callable[[int, int], None]:
+    """What says every second how far the checker is."""
+    told = time.monotonic()
+
+    def progress(done: int, of: int) -> None:
+        nonlocal told
+        if time.monotonic() - told >= 1:
+            told = time.monotonic()
+            console.progress(Checking(file, done, of))
+
+    return progress
 
 
 def _experiments(folder: Path) -> list[Experiment]:
@@ -208,4 +261,4 @@ def _experiments(folder: Path) -> list[Experiment]:
 
 def _json(path: Path) -> dict[str, Any]:
     """The file's content, nothing where there is no file. Raises UserError if it is damaged."""
-    return read_json(path, "remove it, or make it again") if path.is_file() else {}
+    return read_json(path, _ADVICE) if path.is_file() else {}

@@ -48,7 +48,7 @@ def comparison(runs: Sequence[Run]) -> Table:
 def elites(run: Run) -> Table:
     """The archive, best first."""
     plant, options = run.config.plant, _searched_options([run])
-    shown = {name: (found["found"]["sum"], found["rung"]) for name, found in run.certificates.items() if found}
+    shown = {name: (found.shown["sum"], found.guarantee) for name, found in run.certificates.items() if found.shown}
     heads = (
         "elite", *(f"{words(name)} [{unit}]" for name, unit in plant.design.items()), *_weight_heads(run),
         *(POLICY[name] for name in options),
@@ -71,7 +71,7 @@ def elites(run: Run) -> Table:
 
 
 def certificates(runs: Sequence[Run]) -> Table | None:
-    """Proved volumes beside sampled ones; None where nothing was proved."""
+    """Proved volumes beside sampled ones, or why a certificate proves nothing; None where there is none."""
     heads = (
         *_run_head(runs), "elite", "rung", "from [s]", "intervals", "proving",
         "inlet sampled", "inlet shown", "sum sampled", "sum shown", "sum shown / sampled", "integral sampled",
@@ -83,7 +83,7 @@ def certificates(runs: Sequence[Run]) -> Table | None:
 
 def ranks(run: Run) -> tuple[float, int] | None:
     """Spearman's correlation of the sampled and the shown sums and the number of elites; None below three."""
-    sums = [(found["sampled"]["sum"], found["found"]["sum"]) for found in run.certificates.values() if found]
+    sums = [(found.sampled["sum"], found.shown["sum"]) for found in run.certificates.values() if found.shown]
     if len(sums) < 3:
         return None
     from scipy.stats import spearmanr
@@ -135,12 +135,12 @@ def _gains_of(run: Run) -> Iterator[tuple[Cell, ...]]:
         before, after = run.initial.volumes[name] if run.initial else None, run.best.volumes[name]
         label = f"{words(name)} (searched)" if name == searched else words(name)
         times = ratio(after, before) if before is not None else None
-        yield label, volume_unit(run.config, name), before, after, times, told_time(run), run.best.record["rung"]
-    found = run.certificates.get("000") or {"found": {}}
+        yield label, volume_unit(run.config, name), before, after, times, told_time(run), run.best.guarantee
+    found = run.certificates.get("000")
     for name in order:
-        if name in found["found"]:
-            unit, took = volume_unit(run.config, name), duration(found["seconds"])
-            yield words(name), unit, None, found["found"][name], None, took, found["rung"]
+        if found and name in found.shown:
+            unit, took = volume_unit(run.config, name), duration(found.seconds)
+            yield words(name), unit, None, found.shown[name], None, took, found.guarantee
 
 
 def _compared(run: Run, options: Sequence[str]) -> tuple[Cell, ...]:
@@ -153,19 +153,19 @@ def _compared(run: Run, options: Sequence[str]) -> tuple[Cell, ...]:
         *record["weights"]["q"], *record["weights"]["r"], *(record["policy"][name] for name in options),
         *(run.best.volumes[name] for name in VOLUMES),
         ratio(run.best.volumes["sum"], before) if before is not None else None, record["rung"],
-        *((found["found"]["sum"], found["rung"]) if found else (None, None)),
+        *((found.shown["sum"], found.guarantee) if found and found.shown else (None, None)),
         ("kept" if all(kept) else "BROKEN") if kept else None, told_time(run),
     )  # fmt: skip
 
 
 def _certified(run: Run) -> Iterator[tuple[Cell, ...]]:
     for name, found in run.certificates.items():
-        if not found:
-            yield name, "no goal region could be shown", *[None] * 10
+        if not found.shown:
+            yield name, f"none: {found.reason}", *[None] * 10
             continue
-        sampled, shown = found["sampled"], found["found"]
+        sampled, shown = found.sampled, found.shown
         yield (
-            name, found["rung"], found["start"], found["intervals"], duration(found["seconds"]),
+            name, found.guarantee, found.start, found.intervals, duration(found.seconds),
             sampled["inlet"], shown["inlet"], sampled["sum"], shown["sum"], ratio(shown["sum"], sampled["sum"]),
             sampled["integral"], shown["integral"],
         )  # fmt: skip

@@ -18,15 +18,15 @@ from rich.table import Table
 
 from rtcd_jax.analysis.verify.verification import Trial, Verification
 from rtcd_jax.elite.closed_loop import Outcome
-from rtcd_jax.elite.elite import Elite
-from rtcd_jax.elite.records import read_elite, require_elites
+from rtcd_jax.elite.elite import Elite, NoFunnel
+from rtcd_jax.elite.records import INITIAL, elite_folder, require_elites
 from rtcd_jax.system.console import Console
 from rtcd_jax.system.errors import UserError
 from rtcd_jax.system.files import make_folder, reading, replace, replace_json, writing
 from rtcd_jax.system.processes import processes
 
-PLACES = {"000": "elites", "initial": ""}
-"""Which funnels of a run are verified, and where in its folder they are."""
+FUNNELS = "000", INITIAL
+"""Which funnels of a run are verified."""
 
 
 @final
@@ -74,12 +74,11 @@ def verify_run(folder: Path, states: int, seed: int, workers: int, console: Cons
     parts = folder / "verification" / ".parts"
     make_folder(parts)
     trials = {}
-    for funnel in PLACES:
-        status = _read(folder, funnel)[1].get("status")
-        if status == "OK":
+    for funnel in FUNNELS:
+        try:
             trials[funnel] = _trial(folder, funnel, states, seed)
-        else:
-            console.message(f"{funnel}: nothing to verify, it has no funnel ({status})")
+        except NoFunnel as error:
+            console.message(f"{funnel}: nothing to verify, it has no funnel ({error.status})")
     jobs = [
         Job(folder, funnel, states, seed, witness, chunk)
         for funnel, trial in trials.items()
@@ -102,13 +101,9 @@ def verify_run(folder: Path, states: int, seed: int, workers: int, console: Cons
     return all(verification.kept for verification in verifications.values())
 
 
-def _read(folder: Path, funnel: str):
-    return read_elite(folder / PLACES[funnel], funnel)
-
-
 @functools.cache
 def _trial(folder: Path, funnel: str, states: int, seed: int) -> Trial:
-    return Trial(Elite.of(*_read(folder, funnel)), states, seed)
+    return Trial(Elite.read(folder, funnel), states, seed)
 
 
 def _outcomes(jobs: Sequence[Job], parts: Path, workers: int, console: Console) -> dict[Job, Outcome]:
@@ -141,7 +136,7 @@ def _do(job: Job) -> Outcome:
 
 def _part(parts: Path, job: Job) -> Path:
     """Named by all that its contents depend on."""
-    folder = job.run / PLACES[job.funnel]
+    folder = elite_folder(job.run, job.funnel)
     mark = hashlib.sha256(repr(job[1:]).encode())
     for suffix in ("npz", "json"):
         mark.update((folder / f"{job.funnel}.{suffix}").read_bytes())

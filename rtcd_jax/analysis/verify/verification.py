@@ -10,7 +10,7 @@ from scipy.stats import beta
 
 from rtcd_jax.elite.closed_loop import Outcome, simulate
 from rtcd_jax.elite.elite import Elite
-from rtcd_jax.elite.simulators import witness, witnesses
+from rtcd_jax.elite.simulators import simulator_of, simulators_of
 from rtcd_jax.system.errors import UserError
 
 CHUNK = 1000
@@ -111,8 +111,8 @@ class Trial:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Of the witnesses."""
-        return tuple(found.name for found in witnesses(self.elite, 2))
+        """Of the simulators."""
+        return tuple(simulator.name for simulator in simulators_of(self.elite, 2))
 
     def sample(self) -> tuple[Int[np.ndarray, " states"], Float[np.ndarray, "states n"]]:
         """Knots, ascending, and uniform states of their ellipsoids."""
@@ -125,8 +125,8 @@ class Trial:
             UserError: a goal that its own LQR does not hold.
         """
         knots, x = (drawn[chunk :: self.chunks] for drawn in self.sample())
-        seen = witness(self.elite, name, len(x))
-        return simulate(self.elite, seen.dynamics, seen.march, knots, x, seen.settle)
+        simulator = simulator_of(self.elite, name, len(x))
+        return simulate(self.elite, simulator.dynamics, simulator.march, knots, x, simulator.settle)
 
     def verification(self, outcomes: Mapping[tuple[str, int], Outcome]) -> Verification:
         """All chunks' outcomes, by witness and chunk, put together."""

@@ -16,7 +16,7 @@ from rich.table import Table
 
 from rtcd_jax.certificate.audit.external import Cost, Outside, elite_of
 from rtcd_jax.certificate.audit.repair import defects, repaired
-from rtcd_jax.elite.closed_loop import runge_kutta, tracking
+from rtcd_jax.elite.closed_loop import ClosedLoop, runge_kutta
 from rtcd_jax.elite.elite import Elite
 from rtcd_jax.elite.records import write_elite
 from rtcd_jax.elite.simulators import CLOSED_FORMS
@@ -44,11 +44,12 @@ class Escapes(NamedTuple):
 def escapes(elite: Elite, states: int, seed: int) -> Escapes:
     """What `states` uniform random states of every ellipsoid do."""
     f, intervals = CLOSED_FORMS[elite.plant](elite.parameters), len(elite.u)
+    loop = ClosedLoop.of(elite, f)
     knots, x = elite.sample(states * (intervals + 1), np.random.default_rng(seed))
     level, next_level = np.zeros(len(x)), np.zeros(len(x))
     for k in range(intervals):
         moving, step = knots <= k, (elite.time[k + 1] - elite.time[k]) / STEPS
-        *_, x[moving] = runge_kutta(f, step)(tracking(elite, f, k), elite.time[k], elite.time[k + 1], x[moving])
+        *_, x[moving] = runge_kutta(f, step)(loop.tracking(k), elite.time[k], elite.time[k + 1], x[moving])
         now = elite.value(k + 1, x[moving]) / elite.rho[k + 1]
         next_level[knots == k] = now[knots[moving] == k]
         level[moving] = np.maximum(level[moving], now)
@@ -65,8 +66,7 @@ def audit(given: Outside, cost: Cost, states: int, seed: int, out: Path, console
         UserError: no mended motion was found, or a folder that holds something else or cannot be written.
     """
     _claim(out)
-    arrays, record = elite_of(given, cost)
-    seen = escapes(Elite.of(arrays, {**record, "epsilon": 0.0, "confidence": 1.0}), states, seed)
+    seen = escapes(Elite.of(*elite_of(given, cost)), states, seed)
     off = np.max(np.abs(defects(given)), axis=0)
     mended = repaired(given, cost)
     replace_json(out / RECORD, _record(given, mended, seen, off, states, seed))

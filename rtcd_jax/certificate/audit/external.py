@@ -15,14 +15,13 @@ from jaxtyping import Float
 
 from rtcd_jax.certificate.check import PLANTS, Plant
 from rtcd_jax.certificate.prove.closed_loop import linear
+from rtcd_jax.elite.elite import CLAIMED
 from rtcd_jax.system.errors import UserError, closest
 
 EVEN = 1e-6
 """Share of an interval by which the knots' times may be off an even grid."""
 AT_GOAL = 1e-3
 """How far the last state may be from the equilibrium that it stands for."""
-CLAIMED = "claimed"
-"""The rung of volumes that somebody else states."""
 
 
 class Outside(NamedTuple):

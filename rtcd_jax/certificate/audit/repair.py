@@ -18,7 +18,10 @@ from scipy.integrate import solve_ivp
 from scipy.linalg import solve_continuous_are
 
 from rtcd_jax.certificate.audit.external import Cost, Outside
-from rtcd_jax.certificate.prove.closed_loop import hermite, linear, rate, riccati
+from rtcd_jax.certificate.prove.closed_loop import linear, rate
+from rtcd_jax.elite.closed_loop import runge_kutta_step
+from rtcd_jax.elite.funnel import riccati_rate
+from rtcd_jax.numerics.hermite import cubic_hermite
 from rtcd_jax.system.errors import UserError
 
 SUBSTEPS = 20
@@ -48,11 +51,7 @@ def flow(outside: Outside, x: np.ndarray, u: np.ndarray) -> Flow:
     held = u[:, None] + seeds.T[n, None, :]
     h = outside.dt / SUBSTEPS
     for _ in range(SUBSTEPS):
-        a = rate(outside.plant, outside.parameters, state, held)
-        b = rate(outside.plant, outside.parameters, state + h / 2 * a, held)
-        c = rate(outside.plant, outside.parameters, state + h / 2 * b, held)
-        d = rate(outside.plant, outside.parameters, state + h * c, held)
-        state = state + h / 6 * (a + 2 * (b + c) + d)
+        state = runge_kutta_step(lambda _, x: rate(outside.plant, outside.parameters, x, held), state, h)
     slopes = np.imag(state[:, :, :-1]) / step
     return Flow(np.real(state[:, :, -1]).T, np.moveaxis(slopes[:, :, :n], 0, 1), slopes[:, :, n].T)
 
@@ -143,8 +142,9 @@ def tracking_values(outside: Outside, cost: Cost) -> np.ndarray:
         rates = [rate(plant, parameters, x, u) for x in ends]
 
         def backward(t: float, flat: np.ndarray, ends=ends, u=u, rates=rates) -> np.ndarray:
-            x, _ = hermite(1 - t / outside.dt, outside.dt, ends[0], rates[0], ends[1], rates[1])
-            return -riccati(flat.reshape(n, n), *linear(plant, parameters, x, u), q, 1 / r).ravel()
+            x = cubic_hermite(1 - t / outside.dt, outside.dt, ends[0], rates[0], ends[1], rates[1])
+            a, b = linear(plant, parameters, x, u)
+            return -riccati_rate(flat.reshape(n, n), a, b[:, None], q, np.array([r])).ravel()
 
         found = solve_ivp(backward, (0, outside.dt), values[0].ravel(), method="LSODA", rtol=1e-9, atol=1e-9)
         values.insert(0, found.y[:, -1].reshape(n, n))

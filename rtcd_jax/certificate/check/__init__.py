@@ -45,9 +45,22 @@ does not rest on them.
 """
 
 from rtcd_jax.certificate.check.claim import PLANTS, Claim, Plant
-from rtcd_jax.certificate.check.command import main
-from rtcd_jax.certificate.check.exact import PI, PI_ERROR, Q, Refused, alternating, insist, near, root_up, up
-from rtcd_jax.certificate.check.file import Node, parse, read_claim, read_stretch, seal
+from rtcd_jax.certificate.check.command import SECONDS, main, within
+from rtcd_jax.certificate.check.exact import (
+    PI,
+    PI_ERROR,
+    Damaged,
+    Q,
+    Refused,
+    Undecided,
+    alternating,
+    insist,
+    near,
+    printable,
+    root_up,
+    up,
+)
+from rtcd_jax.certificate.check.file import Node, parse, read_bytes, read_claim, read_stretch, seal
 from rtcd_jax.certificate.check.funnel import Motion, Stretch, funnel_obligations, insist_bounds, motion
 from rtcd_jax.certificate.check.goal import Shell, goal_field, goal_obligations
 from rtcd_jax.certificate.check.matrix import cofactors

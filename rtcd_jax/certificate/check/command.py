@@ -1,43 +1,148 @@
 """`rtcd check FILE`: what is proved in plain words, or where the proof fails."""
 
+import hashlib
+import signal
 import sys
-from collections.abc import Sequence
+import threading
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 
 from rtcd_jax.certificate.check.claim import PLANTS
-from rtcd_jax.certificate.check.exact import Refused
-from rtcd_jax.certificate.check.verdict import check_file, sentence
+from rtcd_jax.certificate.check.exact import Refused, Undecided, printable
+from rtcd_jax.certificate.check.file import parse, read_bytes
+from rtcd_jax.certificate.check.verdict import Report, check_file, sentence
 
-USAGE = """\
-usage: rtcd check FILE
+SECONDS = 600.0
+"""For a stranger's file; the cart-pole's take 40 with python-flint."""
+LONGEST_NOTE = 79
+"""Characters of a line that holds a note: it stays one line on a terminal."""
+USAGE = f"""\
+usage: rtcd check FILE [--seconds N] [--controller LAB]
 
 Check a certificate, certificates/NNN.json of a run folder, by exact arithmetic, without any solver. Exit code 0 only
-if all of it holds; 1 if it is refused, with the place and the reason; 2 if there is nothing to read.
+if all of it holds; 1 if it is refused, with the place and the reason; 2 if it is undecided or there is nothing to read.
+
+  --seconds N       give up after so many seconds of wall clock [s] (> 0, default {SECONDS:g})
+  --controller LAB  also: was this folder of `rtcd export` made from the certificate's claim, and is it as it was made?
 
 Example: rtcd check checkpoints/pendulum_rtcd/certificates/000.json"""
 
 
 def main(arguments: Sequence[str]) -> int:
-    """0 and what is proved; 1 and why nothing is; 2 where there is nothing to read."""
-    if arguments[:1] in (["-h"], ["--help"]):
+    """0 and what is proved; 1 and why nothing is; 2 where that is undecided, or there is nothing to read."""
+    if "-h" in arguments or "--help" in arguments:
         print(USAGE)
         return 0
-    if len(arguments) != 1:
-        print(f"{len(arguments)} files: must be one, as in `rtcd check RUN/certificates/000.json`", file=sys.stderr)
+    try:
+        file, seconds, lab = _options(arguments)
+    except ValueError as error:
+        print(f"rtcd check: {printable(error)}", file=sys.stderr)
         return 2
     try:
-        report = check_file(Path(arguments[0]), _counted)
+        with within(seconds):
+            report = check_file(Path(file), _counted)
+            compared = compare(Path(lab), report.digest) if lab is not None else ""
     except OSError as error:
-        print(f"{arguments[0]}: {error.strerror}; a certificate is RUN/certificates/NNN.json", file=sys.stderr)
+        print(f"{printable(error.filename)}: {error.strerror}; a certificate is RUN/certificates/NNN.json"
+              + ", a controller the folder of `rtcd export`" * (lab is not None), file=sys.stderr)  # fmt: skip
+        return 2
+    except Undecided as undecided:
+        print(f"{printable(file)}: {undecided}", file=sys.stderr)
         return 2
     except Refused as refused:
-        print(f"REFUSED {arguments[0]}\n{refused}", file=sys.stderr)
+        print(f"REFUSED {printable(file)}\n{refused}", file=sys.stderr)
         return 1
+    _tell(report)
+    if compared:
+        print(f"NOT THE CONTROLLER OF THIS CERTIFICATE: {printable(lab)}: {compared}", file=sys.stderr)
+        return 1
+    if lab is not None:
+        print(f"The controller in {printable(lab)} was exported from this claim, and its files are as exported.")
+    return 0
+
+
+def _options(arguments: Sequence[str]) -> tuple[str, float, str | None]:
+    """The file, the seconds and the controller's folder. Raises ValueError, which says what would have been right."""
+    files: list[str] = []
+    given: dict[str, str] = {}
+    rest = iter(arguments)
+    for word in rest:
+        name, equals, value = word.partition("=")
+        if name in ("--seconds", "--controller"):
+            value = value if equals else next(rest, "")
+            if not value:
+                raise ValueError(f"{name}: must be followed by its value")
+            given[name] = value
+        elif word.startswith("--"):
+            raise ValueError(f"unknown option {name}; valid: --seconds, --controller")
+        else:
+            files.append(word)
+    if len(files) != 1:
+        raise ValueError(f"{len(files)} files: must be one, as in `rtcd check RUN/certificates/000.json`")
+    told = given.get("--seconds", SECONDS)
+    try:
+        seconds = float(told)
+    except ValueError:
+        seconds = 0.0
+    if not 0 < seconds <= 1e6:
+        raise ValueError(f"--seconds {told}: must be a number > 0 and <= 1e6")
+    return files[0], seconds, given.get("--controller")
+
+
+@contextmanager
+def within(seconds: float) -> Iterator[None]:
+    """Ends what takes longer by Undecided; without any limit outside of the main thread, where no alarm rings."""
+    if threading.current_thread() is not threading.main_thread() or not hasattr(signal, "setitimer"):
+        yield
+        return
+
+    def ring(*_: object) -> None:
+        raise Undecided(f"gave up after {seconds:g} s: undecided; --seconds gives it more")
+
+    former = signal.signal(signal.SIGALRM, ring)
+    signal.setitimer(signal.ITIMER_REAL, seconds, 1.0)  # once more where a callback has swallowed the exception
+    try:
+        yield
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0)
+        signal.signal(signal.SIGALRM, former or signal.SIG_DFL)
+
+
+def compare(lab: Path, digest: str) -> str:
+    """Why the exported folder `lab` is not what was made from the claim of this digest; empty if it is.
+
+    Raises:
+        OSError: there is no `export.json` in it.
+    """
+    try:
+        mark = parse(read_bytes(lab / "export.json"))
+    except Refused as refused:
+        return f"export.json: {refused}"
+    if not (isinstance(mark, dict) and isinstance(mark.get("files"), dict)):
+        return "export.json is none of `rtcd export`"
+    if mark.get("complete") is not True:
+        return "its export was not finished"
+    if mark.get("claim") != digest:
+        theirs = printable(mark["claim"], 64) if isinstance(mark.get("claim"), str) else "none"
+        return f"it was exported from another claim: sha256 {theirs} there, {digest} in the certificate"
+    for name, stored in mark["files"].items():
+        if not name or Path(name).name != name or "\0" in name:
+            return f"export.json names {printable(name, 60)}, which is no file in the folder"
+        try:
+            same = hashlib.sha256(read_bytes(lab / name)).hexdigest() == stored
+        except OSError:
+            return f"{printable(name, 60)} is missing"
+        if not same:
+            return f"{printable(name, 60)} is not as it was exported"
+    return ""
+
+
+def _tell(report: Report) -> None:
     name = next(key for key, plant in PLANTS.items() if plant is report.claim.plant)
     print(sentence(name, report))
     for key, value in report.notes.items():
-        print(f"note, not proved: {key}: {value}")
-    return 0
+        print(printable(f"note of the file's author, not proved: {key}: {value}", LONGEST_NOTE))
 
 
 def _counted(done: int, of: int) -> None:

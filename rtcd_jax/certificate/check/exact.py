@@ -14,6 +14,10 @@ BITS = 80
 """Coefficients are rounded to multiples of 2^-80; every rounding is added to a remainder."""
 MAX_ORDER = 16
 """Of polynomials: no file may ask for more."""
+MAX_TERMS = 6000
+"""Of a Taylor model: a product of two takes two seconds then. The cart-pole's goal region has 2142."""
+MAX_BYTES = 1 << 27
+"""Of a file; the cart-pole's have up to 5e7."""
 PI = Q(314159265358979323846264338327950288419716939937510, 10**50)
 PI_ERROR = Q(1, 10**49)
 
@@ -22,7 +26,29 @@ class Refused(Exception):
     """What is wrong with a certificate, and where."""
 
     def __init__(self, place: str, reason: str):
-        super().__init__(f"{place}: {reason}")
+        super().__init__(printable(f"{place}: {reason}"))
+
+
+class Damaged(Refused):
+    """The file is not what was written: it is no JSON, or a digest is another."""
+
+
+class Undecided(Exception):
+    """Neither accepted nor refused: the file asks for more time or memory than a stranger is given."""
+
+
+def printable(text: object, longest: int = 400) -> str:
+    """A file's own words, on one line of ASCII that no terminal obeys."""
+    shown = str(text)[:longest].encode("unicode_escape").decode("ascii")
+    return shown if len(shown) <= longest and len(str(text)) <= longest else f"{shown[: longest - 3]}..."
+
+
+def rounded(q) -> float:
+    """The double of a number, infinite where it is larger than all doubles."""
+    try:
+        return float(q)
+    except OverflowError:
+        return math.inf if q > 0 else -math.inf
 
 
 def insist(holds: bool, place: str, reason: str) -> None:

@@ -2,16 +2,29 @@
 
 import hashlib
 import json
+import math
 import re
+from pathlib import Path
 from typing import Any, NamedTuple
 
 from rtcd_jax.certificate.check.claim import PLANTS, Claim
-from rtcd_jax.certificate.check.exact import MAX_ORDER, Q, Refused, insist
+from rtcd_jax.certificate.check.exact import (
+    MAX_BYTES,
+    MAX_ORDER,
+    MAX_TERMS,
+    Damaged,
+    Q,
+    Refused,
+    Undecided,
+    insist,
+    rounded,
+)
 from rtcd_jax.certificate.check.funnel import Stretch
 from rtcd_jax.certificate.check.goal import Shell
 from rtcd_jax.certificate.check.squares import Witness, monomials
 
-_DOUBLE = re.compile(r"-?0x[01](\.[0-9a-f]{1,13})?p[+-]\d{1,4}")
+MAX_NOTES = 20
+_DOUBLE = re.compile(r"-?0x[01](\.[0-9a-f]{1,13})?p[+-][0-9]{1,4}")
 
 
 class Node(NamedTuple):
@@ -34,7 +47,8 @@ class Node(NamedTuple):
     def sealed(self) -> None:
         """Refuses values that are not those of the digests."""
         for name, digest in self.value["sha256"].items():
-            insist(digest == seal(self.value[name]), f"{self.place}.{name}", "was changed: its digest is another")
+            if digest != seal(self.value[name]):
+                raise Damaged(f"{self.place}.{name}", "was changed: its digest is another")
 
     def insist(self, holds: bool, reason: str) -> None:
         insist(holds, self.place, reason)
@@ -91,7 +105,7 @@ def read_claim(node: Node) -> Claim:
     for name, value in parameters.items():
         must = ">= 0" if name in ("b", "Beq", "Bp") else "> 0"
         holds = value >= 0 if must == ">= 0" else value > 0
-        insist(holds, f"{given.place}.{name}", f"= {float(value):g}: must be {must}")
+        insist(holds, f"{given.place}.{name}", f"= {rounded(value):g}: must be {must}")
     limits = entries["state_limits"].items(n)
     bounds = [None if limit.value is None else limit.number() for limit in limits]
     dt = entries["dt"].number()
@@ -125,6 +139,12 @@ def read_cases(node: Node, n: int) -> dict[str, Witness]:
     return found
 
 
+def require_few_terms(node: Node, n: int, s_order: int, y_order: int) -> None:
+    """A polynomial of these orders in s and y must be small enough to be multiplied in seconds."""
+    terms = (s_order + 1) * math.comb(y_order + n, n)
+    node.insist(terms <= MAX_TERMS, f"asks for polynomials of {terms} terms, must be at most {MAX_TERMS}")
+
+
 def read_stretch(node: Node, claim: Claim) -> Stretch:
     knot, start, end, first, last, bend, orders, cases = node.keys(
         "knot", "start", "end", "first", "last", "bend", "orders", "cases"
@@ -132,6 +152,7 @@ def read_stretch(node: Node, claim: Claim) -> Stretch:
     node.sealed()
     n = claim.n
     pair = [order.integer(1, MAX_ORDER - 1) for order in orders.items(2)]
+    require_few_terms(orders, n, *pair)
     piece = Stretch(
         knot.integer(0, len(claim.u) - 1), start.number(), end.number(), first.array(n, n), last.array(n, n),
         bend.array(2, n, n), (pair[0], pair[1]), read_cases(cases, n),
@@ -155,29 +176,51 @@ def read_goal(node: Node, claim: Claim) -> tuple[list, int, Any, list[Shell]]:
     node.sealed()
     for i, shell in enumerate(shells):
         place = f"{items.place}[{i}]"
-        insist(shell.start == reached, place, f"starts at {float(shell.start):g}, must start at {float(reached):g}")
+        insist(shell.start == reached, place, f"starts at {rounded(shell.start):g}, must start at {rounded(reached):g}")
         reached = shell.end
-    items.insist(reached == 1, f"ends at {float(reached):g}, must end at 1")
-    return axes.array(claim.n, claim.n), order.integer(2, MAX_ORDER - 2), weight.number(), shells
+    items.insist(reached == 1, f"ends at {rounded(reached):g}, must end at 1")
+    require_few_terms(order, claim.n, MAX_ORDER, order.integer(2, MAX_ORDER - 2))
+    return axes.array(claim.n, claim.n), order.value, weight.number(), shells
+
+
+def read_notes(node: Node) -> dict[str, str]:
+    node.insist(isinstance(node.value, dict), "must be an object")
+    node.insist(len(node.value) <= MAX_NOTES, f"has {len(node.value)} entries, must have at most {MAX_NOTES}")
+    node.insist(all(isinstance(note, str) for note in node.value.values()), "must hold texts")
+    return node.value
 
 
 def _unique(pairs: list[tuple[str, Any]]) -> dict:
     found = dict(pairs)
-    insist(len(found) == len(pairs), "certificate", "has the same key twice")
+    if len(found) != len(pairs):
+        raise Damaged("certificate", "has the same key twice")
     return found
 
 
 def _no_constant(name: str) -> Any:
-    raise Refused("certificate", f"holds {name}")
+    raise Damaged("certificate", f"holds {name}")
 
 
-def parse(text: str) -> Any:
-    """The JSON of a file; refused if it is none."""
+def read_bytes(path: Path) -> bytes:
+    """A file's content; Undecided if it is too large, OSError if it cannot be read."""
+    with path.open("rb") as file:
+        content = file.read(MAX_BYTES + 1)
+    if len(content) > MAX_BYTES:
+        raise Undecided(f"has more than {MAX_BYTES} bytes: undecided")
+    return content
+
+
+def parse(content: bytes) -> Any:
+    """The JSON of a file in ASCII; refused if it is none."""
     try:
-        return json.loads(text, object_pairs_hook=_unique, parse_constant=_no_constant)
+        return json.loads(content.decode("ascii"), object_pairs_hook=_unique, parse_constant=_no_constant)
     except Refused:
         raise
+    except UnicodeDecodeError:
+        raise Damaged("certificate", "is no ASCII text") from None
+    except MemoryError:
+        raise Undecided("needs more memory than there is: undecided") from None
     except RecursionError:
-        raise Refused("certificate", "is nested too deeply") from None
+        raise Damaged("certificate", "is nested too deeply") from None
     except ValueError as error:
-        raise Refused("certificate", f"is no JSON: {error}") from None
+        raise Damaged("certificate", f"is no JSON: {error}") from None

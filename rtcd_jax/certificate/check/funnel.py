@@ -3,7 +3,7 @@
 from typing import Any, NamedTuple
 
 from rtcd_jax.certificate.check.claim import Claim
-from rtcd_jax.certificate.check.exact import Q, alternating, insist, near
+from rtcd_jax.certificate.check.exact import Q, alternating, insist, near, rounded
 from rtcd_jax.certificate.check.matrix import cofactors, dot
 from rtcd_jax.certificate.check.squares import Obligation, Witness, is_positive
 from rtcd_jax.certificate.check.taylor import Space, Taylor, derivative, sine_and_cosine, size
@@ -135,4 +135,4 @@ def insist_bounds(claim: Claim, data: Motion, place: str) -> None:
             room = left * left - dot(data.axes[i], data.axes[i])
             inside = is_positive(left, Q(-1), Q(1)) and is_positive(room, Q(-1), Q(1))
             name = claim.plant.states[i]
-            insist(inside, place, f"the limit |{name}| <= {float(bound):.6g} {claim.plant.units[i]} is not kept")
+            insist(inside, place, f"the limit |{name}| <= {rounded(bound):.6g} {claim.plant.units[i]} is not kept")

@@ -6,7 +6,7 @@ from functools import lru_cache
 from itertools import combinations_with_replacement
 from typing import Any, NamedTuple
 
-from rtcd_jax.certificate.check.exact import Q, insist
+from rtcd_jax.certificate.check.exact import Q, insist, rounded
 from rtcd_jax.certificate.check.taylor import peak, terms_of
 
 
@@ -129,7 +129,7 @@ def margin(todo: Obligation, witness: Witness, place: str):
         for e, c in quadratic(gram, basis).items():
             part[e] = part.get(e, 0) - c
         rest = part.pop((0,) * n, Q(0)) - sum((abs(c) * peak(e) for e, c in part.items()), Q(0)) - todo.error
-        insist(rest > 0, f"{place}.gram[{j}]", f"proves no decrease: at best {float(rest):.3g}, must be > 0")
+        insist(rest > 0, f"{place}.gram[{j}]", f"proves no decrease: at best {rounded(rest):.3g}, must be > 0")
         bound = rest if bound is None else min(bound, rest)
     return bound
 

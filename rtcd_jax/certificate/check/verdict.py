@@ -6,8 +6,17 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from rtcd_jax.certificate.check.claim import Claim
-from rtcd_jax.certificate.check.exact import Q, Refused, insist, root_up
-from rtcd_jax.certificate.check.file import Node, parse, read_claim, read_goal, read_stretch
+from rtcd_jax.certificate.check.exact import Damaged, Q, Undecided, insist, root_up, rounded
+from rtcd_jax.certificate.check.file import (
+    Node,
+    parse,
+    read_bytes,
+    read_claim,
+    read_goal,
+    read_notes,
+    read_stretch,
+    seal,
+)
 from rtcd_jax.certificate.check.funnel import Stretch, funnel_obligations, insist_bounds, motion
 from rtcd_jax.certificate.check.goal import goal_field, goal_obligations, insist_arrival
 from rtcd_jax.certificate.check.matrix import cofactors, dot
@@ -18,9 +27,13 @@ FORMAT, VERSION = "rtcd certificate", 1
 
 
 class Report(NamedTuple):
-    """What an accepted certificate proves, rounded: volumes in the product of the states' units, times in s."""
+    """What an accepted certificate proves, rounded: volumes in the product of the states' units, times in s.
+
+    `digest` is the SHA-256 of the claim's canonical JSON.
+    """
 
     claim: Claim
+    digest: str
     stretches: int
     shells: int
     start: float
@@ -49,7 +62,7 @@ def check_chain(claim: Claim, pieces: Sequence[Stretch], place: str) -> None:
     reached, axes = claim.start, None
     for i, piece in enumerate(pieces):
         here, at, begins = f"{place}[{i}]", reached[0] + reached[1], piece.knot + piece.start
-        where = f"starts at {float(begins):.17g} knots, must start at {float(at):.17g}"
+        where = f"starts at {rounded(begins):.17g} knots, must start at {rounded(at):.17g}"
         insist(begins <= at, here, f"leaves a gap: {where}")
         insist(begins == at, here, f"overlaps: {where}")
         insist(axes is None or axes == piece.first, f"{here}.first", "is not where the interval before it ends")
@@ -82,26 +95,35 @@ def check(content: Any, progress: Callable[[int, int], None] = lambda done, of: 
 
     Raises:
         Refused: it proves nothing, with the place and the reason.
+        Undecided: there is not enough memory for it.
     """
+    try:
+        return _check(content, progress)
+    except RecursionError:
+        raise Damaged("certificate", "is nested too deeply") from None
+    except MemoryError:
+        raise Undecided("needs more memory than there is: undecided") from None
+
+
+def _check(content: Any, progress: Callable[[int, int], None]) -> Report:
     top = Node("certificate", content)
     top.insist(isinstance(content, dict), "must be an object")
     top.insist(content.get("format") == FORMAT, f"is no {FORMAT!r}")
     top.insist(type(content.get("version")) is int and content["version"] == VERSION, f"must be of version {VERSION}")
     _, _, about, funnel, goal, notes = top.keys("format", "version", "claim", "funnel", "goal", "notes")
-    claim = read_claim(about)
+    texts, claim = read_notes(notes), read_claim(about)
     pieces = [read_stretch(item, claim) for item in funnel.items(at_least=1)]
     check_chain(claim, pieces, funnel.place)
     l_goal, rest, shells, least = check_goal(claim, goal, pieces[-1].last)
     for i, piece in enumerate(pieces):
         least = min(least, check_stretch(claim, piece, f"{funnel.place}[{i}]"))
         progress(i + 1, len(pieces))
-    notes.insist(isinstance(notes.value, dict), "must be an object")
     top.sealed()
     volumes, axes = volumes_of(claim, pieces, l_goal)
-    begin = float((claim.start[0] + claim.start[1]) * claim.dt)
+    begin = rounded((claim.start[0] + claim.start[1]) * claim.dt)
     return Report(
-        claim, len(pieces), shells, begin, float(len(claim.u) * claim.dt), volumes, axes,
-        [float(r) for r in rest], float(least), {str(k): str(v) for k, v in notes.value.items()},
+        claim, seal(about.value), len(pieces), shells, begin, rounded(len(claim.u) * claim.dt), volumes, axes,
+        [rounded(r) for r in rest], rounded(least), texts,
     )  # fmt: skip
 
 
@@ -112,10 +134,10 @@ def volumes_of(
     ball = math.pi ** (claim.n / 2) / math.gamma(claim.n / 2 + 1)
 
     def volume(axes) -> float:
-        return ball * float(cofactors(axes)[1])
+        return ball * rounded(cofactors(axes)[1])
 
     def widths(axes) -> list[float]:
-        return [float(root_up(dot(row, row))) for row in axes]
+        return [rounded(root_up(dot(row, row))) for row in axes]
 
     knots = [volume(piece.first) for piece in pieces if piece.start == 0] + [volume(pieces[-1].last)]
     integral = Q(0)
@@ -124,10 +146,17 @@ def volumes_of(
         powers = {e[0]: c for e, c in terms_of(cofactors(data.axes)[1])}
         integral += sum((c / (k + 1) for k, c in powers.items() if k % 2 == 0), Q(0)) * data.duration
     volumes = {
-        "sum": math.fsum(knots), "integral": ball * float(integral), "inlet": volume(pieces[0].first),
+        "sum": _sum(knots), "integral": ball * rounded(integral), "inlet": volume(pieces[0].first),
         "outlet": knots[-1], "goal": volume(l_goal),
     }  # fmt: skip
     return volumes, {"inlet": widths(pieces[0].first), "outlet": widths(pieces[-1].last), "goal": widths(l_goal)}
+
+
+def _sum(values: Sequence[float]) -> float:
+    try:
+        return math.fsum(values)
+    except OverflowError:
+        return math.inf
 
 
 def sentence(name: str, report: Report) -> str:
@@ -146,13 +175,13 @@ def sentence(name: str, report: Report) -> str:
         f"PROVED in continuous time, by exact arithmetic, for the model {name!r} ({numbers}; SI units) under the "
         f"claimed controller, whose input never exceeds {float(claim.limit):.6g} {plant.input_unit}: every motion that "
         f"is in the funnel at some time of [{report.start:.6g} s, {report.end:.6g} s] stays in it, is in the goal "
-        f"region at {report.end:.6g} s, never leaves that region, and comes and stays within "
+        f"region at {report.end:.6g} s, never leaves that region, and converges to within "
         f"{max(report.rest):.1g} of the goal in every state; {kept or 'there is no limit on a state'} all the while. "
         f"Half widths: {extent('inlet')}; {extent('outlet')}; {extent('goal')}. Volumes (proved) [{unit}]: inlet "
         f"{v['inlet']:.6g}, sum over the knots {v['sum']:.6g}, integral over time {v['integral']:.6g} s, goal region "
         f"{v['goal']:.6g}. {report.stretches} intervals of time and {report.shells} of level, smallest margin "
-        f"{report.margin:.2g}. It is a statement about this model, its state known and its input continuous, not about "
-        "hardware."
+        f"{report.margin:.2g}. It is a statement about this model, its state known exactly and its input "
+        f"applied without sampling, not about hardware. Claim: sha256 {report.digest}."
     )
 
 
@@ -160,11 +189,7 @@ def check_file(path: Path, progress: Callable[[int, int], None] = lambda done, o
     """`check` of a file.
 
     Raises:
-        Refused: as `check`.
+        Refused, Undecided: as `check`.
         OSError: the file cannot be read.
     """
-    try:
-        text = path.read_bytes().decode("ascii")
-    except UnicodeDecodeError:
-        raise Refused("certificate", "is no ASCII text") from None
-    return check(parse(text), progress)
+    return check(parse(read_bytes(path)), progress)

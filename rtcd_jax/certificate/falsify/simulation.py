@@ -88,7 +88,7 @@ class Motions:
             UserError: the file cannot be read, or is no certificate.
         """
         try:
-            return cls(check.parse(path.read_text("ascii")))
+            return cls(check.parse(check.read_bytes(path)))
         except OSError as error:
             raise UserError(f"{path}: {error.strerror}") from None
         except (Refused, UnicodeDecodeError, KeyError, TypeError) as error:

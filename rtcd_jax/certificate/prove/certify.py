@@ -1,5 +1,6 @@
 """One elite's certificate: goal region, then funnel, every step kept on disk, so that a killed search goes on."""
 
+import hashlib
 import json
 import time
 from collections.abc import Callable, Mapping
@@ -16,7 +17,8 @@ from rtcd_jax.certificate.prove.backward import SPARE, Descent, Front
 from rtcd_jax.certificate.prove.closed_loop import Loop, claim_of, double, doubles, sealed
 from rtcd_jax.certificate.prove.goal import GoalRegion, goal_region
 from rtcd_jax.certificate.prove.levels import directions, leveled
-from rtcd_jax.elite.records import read_elite
+from rtcd_jax.certificate.standing import accepted, remember
+from rtcd_jax.elite.elite import Elite
 from rtcd_jax.system.files import replace
 from rtcd_jax.system.journal import Journal
 
@@ -68,10 +70,10 @@ def certify_elite(
         UserError: an elite that is not there, or of a plant that the checker does not know.
     """
     began = time.perf_counter()
-    arrays, record = read_elite(run / "elites", name)
-    told, folder = claim_of(arrays, record), run / "certificates"
-    claim = _claim(told, len(arrays["u"]), 1.0)
-    loop, exact = Loop(claim, arrays, record.get("policy")), rung == "proved"
+    elite = Elite.read(run, name)
+    told, folder = claim_of(elite), run / "certificates"
+    claim = _claim(told, len(elite.u), 1.0)
+    loop, exact = Loop(claim, elite), rung == "proved"
     journal = Journal(
         folder / f".{name}.partial.jsonl", {"claim": check.seal(told), "rung": rung, "optimize_value": optimize_value}
     )
@@ -103,24 +105,24 @@ def certify_elite(
         "goal": goal,
         "notes": {"elite": name, "rung at writing": rung},
     }
-    outcome = _finish(folder / f"{name}.json", sealed(content), arrays, rung, seconds, journal)
-    return outcome._replace(beside=record.get("rung", "sampled"))
+    outcome = _finish(folder / f"{name}.json", sealed(content), elite, rung, seconds, journal)
+    return outcome._replace(beside=elite.guarantee)
 
 
-def _finish(
-    path: Path, content: dict[str, Any], arrays: Mapping[str, np.ndarray], rung: str, seconds: float, journal: Journal
-) -> Outcome:
+def _finish(path: Path, content: dict[str, Any], elite: Elite, rung: str, seconds: float, journal: Journal) -> Outcome:
     """The written certificate; on the rung *proved* it was accepted as a whole before."""
+    file = (json.dumps(content, separators=(",", ":")) + "\n").encode()
     if rung == "proved":
-        check.check(content)
-    replace(path, (json.dumps(content, separators=(",", ":")) + "\n").encode())
+        digest = hashlib.sha256(file).hexdigest()
+        remember(digest, accepted(check.check(check.parse(file)), digest))
+    replace(path, file)
     journal.close()
     claim = check.read_claim(Node("claim", content["claim"]))
     pieces = [check.read_stretch(Node("funnel", each), claim) for each in content["funnel"]]
     axes = Node("goal.axes", content["goal"]["axes"]).array(claim.n, claim.n)
     found, _ = check.volumes_of(claim, pieces, axes)
     start = float(pieces[0].knot + pieces[0].start)
-    per_knot, step = np.asarray(arrays["volumes_per_knot"])[int(np.ceil(start)) :], float(arrays["time"][1])
+    per_knot, step = elite.volumes_per_knot[int(np.ceil(start)) :], float(elite.time[1])
     sampled = {
         "inlet": float(per_knot[0]),
         "sum": float(per_knot.sum()),

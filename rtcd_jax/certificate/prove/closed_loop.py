@@ -7,6 +7,9 @@ from typing import Any, final
 import numpy as np
 
 from rtcd_jax.certificate import check
+from rtcd_jax.elite.elite import Elite
+from rtcd_jax.elite.funnel import value_rates
+from rtcd_jax.numerics.hermite import cubic_hermite, cubic_hermite_rate
 from rtcd_jax.system.errors import UserError
 
 CLIMBERS, TRIES = 8, 40
@@ -29,36 +32,36 @@ def sealed(record: Mapping[str, Any]) -> dict[str, Any]:
     return {**record, "sha256": {name: check.seal(value) for name, value in record.items()}}
 
 
-def claim_of(arrays: Mapping[str, np.ndarray], record: Mapping[str, Any]) -> dict[str, Any]:
-    """The claim about a stored elite, without `start`: what is to be proved is written down before the proof.
+def claim_of(elite: Elite) -> dict[str, Any]:
+    """The claim about an elite, without `start`: what is to be proved is written down before the proof.
 
     The rates of the cubic Hermite interpolant are f(x_k, u_k) and f(x_{k+1}, u_k), rounded to doubles.
 
     Raises:
         UserError: a plant that the checker does not know, or more than one input.
     """
-    name = record["plant"]
+    name = elite.plant
     if name not in check.PLANTS:
         raise UserError(f"no certificate for the plant {name!r}: the checker knows {', '.join(check.PLANTS)}")
-    plant, x, u = check.PLANTS[name], arrays["x"], arrays["u"]
+    plant, x, u = check.PLANTS[name], elite.x, elite.u
     if u.shape[1] != 1:
         raise UserError(f"no certificate for {u.shape[1]} inputs: the checker knows loops with one")
-    parameters = {key: float(record["parameters"][key]) for key in plant.parameters}
-    if float(arrays["u_max"][0]) != parameters[plant.limit]:
-        raise UserError(f"u_max = {arrays['u_max'][0]}: must be {plant.limit} = {parameters[plant.limit]}")
+    parameters = {key: float(elite.parameters[key]) for key in plant.parameters}
+    if float(elite.u_max[0]) != parameters[plant.limit]:
+        raise UserError(f"u_max = {elite.u_max[0]}: must be {plant.limit} = {parameters[plant.limit]}")
     ends = np.stack([x[:-1], x[1:]])
     rates = np.moveaxis(rate(plant, parameters, np.moveaxis(ends, 2, 0), u[:, 0]), 0, 2)
     return {
         "plant": name,
         "parameters": {key: double(value) for key, value in parameters.items()},
-        "state_limits": [None if limit is None else double(limit) for limit in record["state_limits"]],
-        "dt": double(arrays["time"][1] - arrays["time"][0]),
+        "state_limits": [double(limit) if np.isfinite(limit) else None for limit in elite.state_limits],
+        "dt": double(elite.time[1] - elite.time[0]),
         "x": doubles(x),
         "rates": doubles(np.swapaxes(rates, 0, 1)),
         "u": doubles(u[:, 0]),
-        "K": doubles(arrays["K"][:, 0]),
-        "x_goal": doubles(arrays["x_goal"]),
-        "K_goal": doubles(arrays["K_goal"][0]),
+        "K": doubles(elite.K[:, 0]),
+        "x_goal": doubles(elite.x_goal),
+        "K_goal": doubles(elite.K_goal[0]),
     }
 
 
@@ -86,7 +89,7 @@ class Loop:
     it is `shaped` anew.
     """
 
-    def __init__(self, claim: check.Claim, arrays: Mapping[str, np.ndarray], policy: Mapping[str, float] | None = None):
+    def __init__(self, claim: check.Claim, elite: Elite):
         def floats(values: Any) -> Any:
             return np.array(_floats(values))
 
@@ -97,16 +100,12 @@ class Loop:
         self.x, self.rates, self.u = floats(claim.x), floats(claim.rates), floats(claim.u)
         self.gains, self.goal, self.goal_gain = floats(claim.K), floats(claim.x_goal), floats(claim.K_goal)
         self.bounds = np.array([np.inf if b is None else float(b) for b in claim.bounds])
-        self.values = np.asarray(arrays["S"])
-        told = policy or {}
-        q, r = np.asarray(arrays["Q"]), told.get("input_weight", 1.0) * float(arrays["R"][0, 0])
-        left = np.maximum(1 - np.abs(self.u) / self.limit, told.get("authority", 1.0))
-        shift = told.get("discount", 0.0) * np.eye(self.n)
-        self.slopes = np.zeros((len(self.u), 2, self.n, self.n))
+        self.values = elite.S
+        a, b = np.zeros((len(self.u), 2, self.n, self.n)), np.zeros((len(self.u), 2, self.n, 1))
         for k, u in enumerate(self.u):
             for end in (0, 1):
-                a, b = linear(self.plant, self.parameters, self.x[k + end], u)
-                self.slopes[k, end] = riccati(self.values[k + end], a + shift, b, q, left[k] ** 2 / r)
+                a[k, end], b[k, end, :, 0] = linear(self.plant, self.parameters, self.x[k + end], u)
+        self.slopes = value_rates(elite, a, b)
 
     def rate(self, x: np.ndarray, u: Any) -> np.ndarray:
         return rate(self.plant, self.parameters, x, u)
@@ -120,6 +119,13 @@ class Loop:
     def nominal(self, k: int, share: float) -> tuple[np.ndarray, np.ndarray]:
         """x* and x*' at a share of the interval k."""
         return hermite(share, self.dt, self.x[k], self.rates[k, 0], self.x[k + 1], self.rates[k, 1])
+
+    def error_rate(self, k: int, share: float, error: np.ndarray) -> np.ndarray:
+        """e' = f(x* + e, u) - x*' [n D] for errors e [n D] from the nominal motion."""
+        center, center_rate = self.nominal(k, share)
+        gain = (1 - share) * self.gains[k] + share * self.gains[k + 1]
+        u = np.clip(self.u[k] - gain @ error, -self.limit, self.limit)
+        return self.rate(center[:, None] + error, u) - center_rate[:, None]
 
     def value(self, k: int, share: float) -> tuple[np.ndarray, np.ndarray]:
         """S and S'."""
@@ -147,25 +153,17 @@ class Loop:
         """The largest V' / V over the surface V = rho, looked for from the sampled directions [n D]."""
         s, slope = self.value(k, share)
         axes, _ = self.axes(k, share, rho, 0.0)
-        center, center_rate = self.nominal(k, share)
-        gain = (1 - share) * self.gains[k] + share * self.gains[k + 1]
 
         def rises(y: np.ndarray) -> np.ndarray:
             error = axes @ y
-            u = np.clip(self.u[k] - gain @ error, -self.limit, self.limit)
-            fall = self.rate(center[:, None] + error, u) - center_rate[:, None]
+            fall = self.error_rate(k, share, error)
             return np.sum((s @ error) * (2 * fall) + error * (slope @ error), axis=0) / rho
 
         return _highest(rises, directions)
 
     def drift(self, k: int, share: float, axes: np.ndarray, y: np.ndarray) -> np.ndarray:
         """y'L^-1 (f(x* + L y, u) - x*') [D] for directions y [n D] of an ellipsoid L."""
-        center, center_rate = self.nominal(k, share)
-        gain = (1 - share) * self.gains[k] + share * self.gains[k + 1]
-        error = axes @ y
-        u = np.clip(self.u[k] - gain @ error, -self.limit, self.limit)
-        fall = self.rate(center[:, None] + error, u) - center_rate[:, None]
-        return np.sum(y * np.linalg.solve(axes, fall), axis=0)
+        return np.sum(y * np.linalg.solve(axes, self.error_rate(k, share, axes @ y)), axis=0)
 
     def rooms(self, k: int, share: float) -> np.ndarray:
         """The half widths [n] that the limits on the states leave to an ellipsoid."""
@@ -219,14 +217,7 @@ def _floats(values: Any) -> Any:
     return [_floats(v) for v in values] if isinstance(values, list | tuple) else float(values)
 
 
-def hermite(share: float, dt: float, a: Any, a_rate: Any, b: Any, b_rate: Any) -> tuple[Any, Any]:
+def hermite(share: Any, dt: float, a: Any, a_rate: Any, b: Any, b_rate: Any) -> tuple[Any, Any]:
     """Value and rate of the cubic with these values and rates at the ends of an interval of `dt`."""
-    t, rest = share, 1 - share
-    value = rest * rest * ((1 + 2 * t) * a + t * dt * a_rate) + t * t * ((3 - 2 * t) * b - rest * dt * b_rate)
-    slope = 6 * t * rest * (b - a) / dt + rest * (1 - 3 * t) * a_rate + t * (3 * t - 2) * b_rate
-    return value, slope
-
-
-def riccati(s: np.ndarray, a: np.ndarray, b: np.ndarray, q: np.ndarray, r_inverse: float) -> np.ndarray:
-    """S' = -(A'S + S A - S B R^-1 B'S + Q)."""
-    return -(a.T @ s + s @ a - r_inverse * np.outer(s @ b, s @ b) + q)
+    ends = share, dt, a, a_rate, b, b_rate
+    return cubic_hermite(*ends), cubic_hermite_rate(*ends)

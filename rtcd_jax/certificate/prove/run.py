@@ -18,7 +18,8 @@ from scipy.stats import spearmanr
 
 from rtcd_jax.certificate.prove.certify import Outcome, Step, certify_elite
 from rtcd_jax.certificate.prove.closed_loop import claim_of
-from rtcd_jax.elite.records import read_elite, require_elites
+from rtcd_jax.elite.elite import Elite
+from rtcd_jax.elite.records import require_elites
 from rtcd_jax.system.console import Console
 from rtcd_jax.system.files import make_folder, read_json, replace_json
 from rtcd_jax.system.processes import CONTEXT, processes
@@ -61,7 +62,7 @@ def certify_run(
     """
     names = require_elites(folder)[:elites]
     for name in names:  # at once, and not from a worker
-        claim_of(*read_elite(folder / "elites", name))
+        claim_of(Elite.read(folder, name))
     target = folder / "certificates"
     make_folder(target)
     summary = target / "summary.json"

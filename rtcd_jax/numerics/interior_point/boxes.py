@@ -7,11 +7,11 @@ from jaxtyping import Array, Float
 
 
 class Boxed(NamedTuple):
-    """One value for each bounded variable: interior states with a finite limit, inputs, the step."""
+    """One value for each bounded variable: interior states with a finite limit, inputs, the step if it is free."""
 
     xs: Float[Array, "N-1 b P"]
     us: Float[Array, "N m P"]
-    h: Float[Array, "1 P"]
+    h: Float[Array, "s P"]
 
 
 def total(a):

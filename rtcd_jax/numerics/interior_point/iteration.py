@@ -36,11 +36,12 @@ class Iteration:
         full = lambda value: jnp.full((batch,), value, self.model.dtype)  # noqa: E731
         barrier = full(self.settings.barrier_start)
         zero = jnp.zeros((batch,), jnp.int32)
-        defects, cost = self.model.simulate(xs, inside.us, inside.h[0], parameters)
+        h = inside.h[0] if self.model.free_step else guess.h
+        defects, cost = self.model.simulate(xs, inside.us, h, parameters)
         return Iterate(
             xs=xs,
             us=inside.us,
-            h=inside.h[0],
+            h=h,
             multipliers=jnp.zeros_like(defects),
             duals=jax.tree.map(lambda slack: barrier / slack, self.model.slacks(inside)),
             barrier=barrier,
@@ -95,8 +96,9 @@ class Iteration:
         by_state = slope[1:, :n] - it.multipliers[:-1]
         by_state = by_state.at[:, self.model.boxed].add(it.duals.xs[1] - it.duals.xs[0])
         by_input = slope[:, n + 1 :] + it.duals.us[1] - it.duals.us[0]
-        by_step = total(slope[:, n]) + it.duals.h[1, 0] - it.duals.h[0, 0]
-        error = jnp.maximum(jnp.maximum(largest(by_state), largest(by_input)), jnp.abs(by_step))
+        error = jnp.maximum(largest(by_state), largest(by_input))
+        if self.model.free_step:
+            error = jnp.maximum(error, jnp.abs(total(slope[:, n]) + it.duals.h[1, 0] - it.duals.h[0, 0]))
         count = it.multipliers[..., 0].size + sum(leaf[..., 0].size for leaf in it.duals)
         mean = (total(jnp.abs(it.multipliers)) + sum_over(it.duals)) / count
         return error / (jnp.maximum(100.0, mean) / 100.0)
@@ -126,14 +128,11 @@ class Iteration:
             gradient[n + 1 + i] += force.us[:, i]
         every = (it.us.shape[0], it.h.shape[-1])
         hessian = [[*row[:i], jnp.broadcast_to(row[i], every)] for i, row in enumerate(hessian)]
-        return kkt.Subproblem(
-            hessian=hessian,
-            gradient=gradient,
-            jacobian=expansion.jacobian,
-            defects=it.defects,
-            curvature=stiffness.h[0] + it.regularization * self.model.step_scaling,
-            slope=force.h[0],
-        )
+        if self.model.free_step:
+            curvature, by_step = stiffness.h[0] + it.regularization * self.model.step_scaling, force.h[0]
+        else:  # a fixed step is one that no slope moves
+            curvature, by_step = jnp.full_like(it.h, jnp.inf), jnp.zeros_like(it.h)
+        return kkt.Subproblem(hessian, gradient, expansion.jacobian, it.defects, curvature, by_step)
 
     def move(self, it: Iterate, slacks: Boxed, subproblem: kkt.Subproblem, parameters) -> Iterate:
         """Newton step, fraction to the boundary, filter line search, new regularization."""

@@ -19,13 +19,14 @@ class Model:
         self.boxed = np.flatnonzero(np.isfinite(problem.state_limits))
         x_limit = problem.state_limits[self.boxed]
         low, high = problem.step_limits
+        self.free_step = low < high  # else h is a number, no variable: no slack, no dual, no step
         as_column = lambda a: jnp.asarray(np.asarray(a, float), dtype)[:, None]  # noqa: E731
-        self.lower = Boxed(as_column(-x_limit), as_column(-problem.input_limits), as_column([low]))
-        self.upper = Boxed(as_column(x_limit), as_column(problem.input_limits), as_column([high]))
+        self.lower = Boxed(as_column(-x_limit), as_column(-problem.input_limits), as_column([low] * self.free_step))
+        self.upper = Boxed(as_column(x_limit), as_column(problem.input_limits), as_column([high] * self.free_step))
         travel = np.maximum(1.0, np.abs(problem.start - problem.goal))
         scale_x = np.where(np.isfinite(problem.state_limits), problem.state_limits, travel)
         self.scaling = [float(s) for s in (*1 / scale_x**2, 0.0, *1 / problem.input_limits**2)]
-        self.step_scaling = 4 / (high - low) ** 2
+        self.step_scaling = 4 / (high - low) ** 2 if self.free_step else 0.0
 
     def simulate(self, xs, us, h, parameters):
         """Defects [N n P] and the objective [P]."""
@@ -59,7 +60,7 @@ class Model:
 
     def values(self, xs, us, h) -> Boxed:
         """The bounded variables of a point."""
-        return Boxed(xs[1:-1, self.boxed], us, h[None])
+        return Boxed(xs[1:-1, self.boxed], us, h[None] if self.free_step else h[None][:0])
 
     def slacks(self, values: Boxed) -> Boxed:
         """Their distances from the lower and the upper bounds, on a leading axis."""

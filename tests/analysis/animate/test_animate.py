@@ -67,7 +67,7 @@ def test_without_an_initial_funnel_the_best_is_shown_alone(tmp_path, backend):
     folder = loop_folder(tmp_path / "run", "pendulum", initial={"status": "FUNNEL_EMPTY"})
     done = rtcd("animate", folder)
     assert done.returncode == 0, done.stdout + done.stderr
-    assert "initial: nothing to show, it has no funnel (FUNNEL_EMPTY)" in done.stdout
+    assert "the initial candidate has no funnel (FUNNEL_EMPTY): the best elite is shown alone" in done.stdout
     with Image.open(folder / "animation" / "swingup.gif") as gif:
         assert gif.size == (animate.SIDE // 2, animate.SIDE + animate.GAP // 2)
 

@@ -4,13 +4,12 @@ import dataclasses
 
 from rtcd_jax.analysis.disturb.comparison import contest_of
 from rtcd_jax.elite.elite import Elite
-from rtcd_jax.elite.records import read_elite
 from tests.export.folders import run_folder
 
 
 def elite_of(path, plant):
     """The elite of a fresh run folder at `path`."""
-    return Elite.of(*read_elite(run_folder(path, plant) / "elites", "000"))
+    return Elite.read(run_folder(path, plant), "000")
 
 
 def contest(path, plant):

@@ -14,7 +14,7 @@ from rtcd_jax.analysis.disturb.experiments import SCORED
 from rtcd_jax.analysis.disturb.scenarios import undisturbed
 from rtcd_jax.elite.closed_loop import runge_kutta, simulate
 from rtcd_jax.elite.records import read_elite, write_elite
-from rtcd_jax.elite.simulators import witnesses
+from rtcd_jax.elite.simulators import simulators_of
 from rtcd_jax.system.errors import UserError
 from tests.export.folders import run_folder
 
@@ -105,8 +105,8 @@ def test_verdicts_are_the_verifications(tmp_path):
     x[::2] = elite.x[0] + 3 * (x[::2] - elite.x[0])
     lanes = undisturbed(contest.plant, contest.design, np.ones(60, int), x.T)
     found = run(contest, lanes, 0, "", NoMeter(), settles=True)
-    witness = next(witnesses(elite, 60))
-    seen = simulate(elite, witness.dynamics, runge_kutta(witness.dynamics, 2e-3), np.zeros(60, int), x)
+    simulator = next(simulators_of(elite, 60))
+    seen = simulate(elite, simulator.dynamics, runge_kutta(simulator.dynamics, 2e-3), np.zeros(60, int), x)
     lost = found.left_limits | ~(found.final <= 1e-3)
     assert 0 < lost.sum() < 60
     np.testing.assert_array_equal(lost, seen.left_limits | seen.missed_goal)
@@ -137,7 +137,7 @@ def test_an_initial_candidate_without_a_funnel_is_left_out(tmp_path):
     write_elite(folder, "initial", arrays, record | {"status": "FUNNEL_EMPTY"})
     console = Remembering()
     assert read_contest(folder, console).names == ("best",)
-    assert console.lines == ["initial: left out, it has no funnel (FUNNEL_EMPTY)"]
+    assert console.lines == ["the initial candidate has no funnel (FUNNEL_EMPTY): the best elite is disturbed alone"]
 
 
 def test_a_run_without_elites_is_refused(tmp_path):

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from rtcd_jax.analysis.disturb.scenarios import CHUNK, STEP, Loops, advance, start, undisturbed
-from rtcd_jax.elite.closed_loop import holding, runge_kutta, tracking
+from rtcd_jax.elite.closed_loop import ClosedLoop, runge_kutta
 from rtcd_jax.elite.simulators import CLOSED_FORMS
 
 COUNT = 512
@@ -51,7 +51,7 @@ def test_the_law_is_that_of_the_verifications_loop(robots):
         found = robots.loops.law(jnp.arange(2), jnp.asarray(t), tuple(jnp.asarray(x).T))
         for i, elite in enumerate(robots.elites):
             k = int(t / elite.time[1])
-            policy = tracking(elite, f, k) if t < last else holding(elite)
+            policy = ClosedLoop.of(elite, f).tracking(k) if t < last else ClosedLoop.of(elite, f).holding()
             np.testing.assert_allclose(jnp.stack(found)[:, i], policy(t, x[i : i + 1])[0], rtol=1e-9, atol=1e-9)
 
 
@@ -59,13 +59,14 @@ def test_undisturbed_motions_are_the_verifications_up_to_the_hold(robots):
     """Deviations from the motion that starts on x*: holding the input lags the loop by half a step, here below 1 %."""
     elite = robots.elites[0]
     f = CLOSED_FORMS[elite.plant](elite.parameters)
+    loop = ClosedLoop.of(elite, f)
     offsets = 0.02 * np.random.default_rng(1).normal(size=(8, robots.plant.n))
     offsets[0] = 0
     motion = moved(robots, lanes_of(robots, np.zeros(8, int), elite.x[0] + offsets))
     x, seconds, march = elite.x[0] + offsets, CHUNK * STEP, runge_kutta(f, STEP)
     for k in range(len(elite.u)):
-        *_, x = march(tracking(elite, f, k), elite.time[k], elite.time[k + 1], x)
-    *_, x = march(holding(elite), 0.0, seconds - elite.time[-1], x)
+        *_, x = march(loop.tracking(k), elite.time[k], elite.time[k + 1], x)
+    *_, x = march(loop.holding(), 0.0, seconds - elite.time[-1], x)
     found = np.asarray(motion.x[:, :8].T)
     np.testing.assert_allclose(found - found[0], x - x[0], atol=1e-2 * np.abs(offsets).max())
     assert not motion.left.any()
@@ -79,14 +80,14 @@ def _oracle(contest, index, x, seconds, *, strength, period, delay, lag, center,
     if elite.plant == "cartpole":
         parameters["inertia_about_com"] = parameters["Mp"] * parameters["lp"] ** 2 / 3
     f = CLOSED_FORMS[elite.plant](parameters)
-    known = CLOSED_FORMS[elite.plant](elite.parameters)
+    known = ClosedLoop.of(elite, CLOSED_FORMS[elite.plant](elite.parameters))
     past, given, command = [x], 0.0, 0.0
     for i in range(round(seconds / STEP)):
         t = i * STEP
         if i % period == 0:
             seen = past[max(0, i - delay)]
             k = int(np.floor(t / elite.time[1]))
-            policy = tracking(elite, known, k) if k < len(elite.u) else holding(elite)
+            policy = known.tracking(k) if k < len(elite.u) else known.holding()
             command = policy(t, seen[None])[0, 0]
         given += (1 - np.exp(-STEP / lag)) * (command - given)
         bound = strength * elite.u_max[0]

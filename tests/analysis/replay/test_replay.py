@@ -6,13 +6,16 @@ import json
 import numpy as np
 import pytest
 
-from rtcd_jax.analysis.replay.measured import columns_of, jumps, read_measured
+from rtcd_jax.analysis.replay.measured import jumps, read_measured
 from rtcd_jax.analysis.replay.replay import replay_run
-from rtcd_jax.elite.funnel import Tube
+from rtcd_jax.config.schema import PLANTS
+from rtcd_jax.elite.elite import Elite
+from rtcd_jax.elite.funnel import FunnelInterpolant
 from rtcd_jax.elite.records import write_elite
 from rtcd_jax.system.errors import UserError
 from tests.analysis.report.loops import LOOPS, loop_folder, stored
 
+STATES = {name: plant.states for name, plant in PLANTS.items()}
 HEADS = {"pendulum": "time,pos,vel,torque", "cartpole": "time,pos1,pos2,vel1,vel2,tau1,tau2"}
 
 
@@ -27,11 +30,11 @@ class Said:
 def motion(plant, scale, samples=41, after=0.05):
     """Times beyond the last knot, and states at sqrt(V/rho) = scale(t) along a fixed direction."""
     arrays, record = stored(plant)
-    tube = Tube.of(arrays, record)
+    funnel = FunnelInterpolant.of(Elite.of(arrays, record))
     time = np.linspace(0, arrays["time"][-1] + after, samples)
     direction = np.ones(arrays["x"].shape[1])
-    lengths = np.sqrt(tube.level(time) / np.einsum("i,tij,j->t", direction, tube.value(time), direction))
-    return time, tube.nominal(time) + (scale(time) * lengths)[:, None] * direction
+    lengths = np.sqrt(funnel.level(time) / np.einsum("i,tij,j->t", direction, funnel.value(time), direction))
+    return time, funnel.nominal(time) + (scale(time) * lengths)[:, None] * direction
 
 
 def measured_file(path, plant, time, x):
@@ -113,28 +116,16 @@ def test_the_figure_shows_what_was_measured_and_marks_what_was_outside(tmp_path,
     np.testing.assert_allclose(fill.lines[0].get_ydata(), np.where(time < 0.03, 0.25, 4.0))
 
 
-def test_columns_are_found_by_name_in_any_order_and_others_are_not_looked_at(tmp_path):
-    path = tmp_path / "lab.csv"
-    path.write_text("\ufeffvel, pos ,note,time\n1,2,x,0\n\n3,4,,0.5\n", encoding="utf-8")
-    found = read_measured(path, 2)
-    np.testing.assert_array_equal(found.time, [0, 0.5])
-    np.testing.assert_array_equal(found.x, [[2, 1], [4, 3]])
-
-
 @pytest.mark.parametrize(
     ("text", "message"),
     [
         (None, "no such file; must be a CSV"),
-        ("", "is empty: must begin with the columns' names"),
-        ("time,pos,vel,torque\n", "has no samples"),
-        ("time,pos,torque\n0,0,0\n", "lacks the column vel: must have time,pos,vel,torque"),
-        ("t,p\n0,0\n", "lacks the columns time, pos, vel: must have"),
-        ("time,pos,vel\n0,0,0\n1,nan,0\n", "line 3: pos = 'nan': must be a finite number"),
-        ("time,pos,vel\n0,0,0\n\n1,x,0\n", "line 4: pos = 'x': must be a finite number"),
-        ("time,pos,vel\n0,0\n", "line 2: vel = '': must be a finite number"),
-        ("time,pos,vel\n0,0,0\n1,0,0\n1,0,0\n", "line 4: time = 1 after 1: must rise"),
-        ("time,pos,vel\n-1,0,0\n1,0,0\n", r"time begins at -1 s: must begin in \[0, 0.2\)"),
+        ("", "is empty: must be a CSV of measured states"),
+        ("time,pos,vel,torque\n", "has no samples, only its columns: time, pos, vel, torque"),
+        ("time,pos,vel\n-1,0,0\n1,0,0\n", r"time begins at -1 s: must begin in \[0, 0.2\).*--start T"),
         ("time,pos,vel\n1000,0,0\n1001,0,0\n", r"time begins at 1000 s: must begin in \[0, 0.2\)"),
+        ("time,pos,vel\n0,3,0\n", "has 1 sample of the motion, which takes 0.2 s: must have 2 at least"),
+        ("time,pos,vel\n0,3,0\n5,3,0\n", "has 1 sample of the motion"),
     ],
 )
 def test_what_is_no_measured_motion_is_refused(tmp_path, text, message):
@@ -146,16 +137,10 @@ def test_what_is_no_measured_motion_is_refused(tmp_path, text, message):
     assert not (folder / "replay").exists()
 
 
-def test_a_file_that_is_no_text_is_refused(tmp_path):
-    (tmp_path / "lab.csv").write_bytes(b"\xff\xfe\x00\x01")
-    with pytest.raises(UserError, match="cannot read"):
-        read_measured(tmp_path / "lab.csv", 2)
-
-
 def test_a_run_that_cannot_be_replayed_is_refused(tmp_path, figures):
     folder = loop_folder(tmp_path / "run", "pendulum")
     path = measured_file(tmp_path / "lab.csv", "pendulum", *motion("pendulum", lambda t: 0 * t))
-    with pytest.raises(UserError, match=r"has no 003.npz with its 003.json; there is 000"):
+    with pytest.raises(UserError, match=r"has no elite 003; there are 000"):
         replay_run(folder, path, 3, Said())
     with pytest.raises(UserError, match="is no run folder"):
         replay_run(tmp_path, path, 0, Said())
@@ -164,15 +149,76 @@ def test_a_run_that_cannot_be_replayed_is_refused(tmp_path, figures):
         replay_run(folder, path, 0, Said())
 
 
-@pytest.mark.parametrize(("step", "told"), [(3.0, 0), (3.2, 1)])
-def test_half_a_turn_between_two_samples_looks_wrapped(tmp_path, step, told):
+@pytest.mark.parametrize(
+    ("kept", "share", "words"),
+    [
+        (slice(None), 1.0, "inside the funnel all the way"),
+        (slice(1, None), 0.975, "inside the funnel all the way"),  # what is missing is shorter than an interval
+        (slice(0, 5), 0.1, "inside the funnel at every sample"),
+        (slice(0, None, 40), 0.0, "inside the funnel at every sample"),  # two samples, whatever was between them
+        (np.r_[0:11, 31:41], 0.475, "inside the funnel at every sample"),  # a gap of half the motion
+    ],
+)
+def test_all_the_way_is_said_of_motions_that_were_measured_all_the_way(tmp_path, figures, kept, share, words):
+    folder = loop_folder(tmp_path / "run", "pendulum")
+    time, x = motion("pendulum", lambda t: np.full_like(t, 0.5), after=0.0)
+    said = Said()
+    assert replay_run(folder, measured_file(tmp_path / "lab.csv", "pendulum", time[kept], x[kept]), 0, said)
+    record = json.loads((folder / "replay" / "lab_000.json").read_text())
+    assert record["share_covered"] == pytest.approx(share)
+    assert any(line.startswith(words) for line in said.lines)
+    assert any(f"they cover {share:.1%}" in line for line in said.lines)
+    assert any("nothing is known of the other" in line for line in said.lines) is ("all the way" not in words)
+
+
+def test_the_motion_begins_where_the_user_says(tmp_path, figures):
+    folder = loop_folder(tmp_path / "run", "pendulum")
+    time, x = motion("pendulum", lambda t: np.full_like(t, 0.7))
+    waiting = np.linspace(0, 7.9, 5)
+    later = np.concatenate([waiting, time + 8]), np.concatenate([np.zeros((5, 2)), x])
+    said = Said()
+    path = measured_file(tmp_path / "lab.csv", "pendulum", *later)
+    assert replay_run(folder, path, 0, said, start=8.0)
+    assert any("begins at 8 s of the file; 5 rows before that left out" in line for line in said.lines)
+    record = json.loads((folder / "replay" / "lab_000.json").read_text())
+    assert record["closest"]["V/rho"] == pytest.approx(0.49)
+    with pytest.raises(UserError, match=r"--start = 9: .* ends before that, at 8.25 s"):
+        replay_run(folder, path, 0, Said(), start=9.0)
+
+
+def test_turns_are_taken_out_of_angles_that_wrap(tmp_path, figures):
+    """An encoder of one turn, and a count of turns that was not at zero."""
+    folder = loop_folder(tmp_path / "run", "pendulum")
+    time, x = motion("pendulum", lambda t: np.full_like(t, 0.7))
+    wrapped = x.copy()
+    middle = np.median(x[:, 0])
+    wrapped[:, 0] = (x[:, 0] - middle) % (2 * np.pi) + middle - 4 * np.pi
+    assert np.ptp(wrapped[:, 0]) > 6
+    path = measured_file(tmp_path / "lab.csv", "pendulum", time, wrapped)
+    said = Said()
+    assert not replay_run(folder, path, 0, said)
+    assert any("theta jumps by" in line and "--unwrap" in line for line in said.lines)
+    assert replay_run(folder, path, 0, Said(), unwrap=True)
+    record = json.loads((folder / "replay" / "lab_000.json").read_text())
+    assert record["closest"]["V/rho"] == pytest.approx(0.49)
+
+
+def test_the_columns_that_were_taken_are_told(tmp_path, figures):
+    folder = loop_folder(tmp_path / "run", "pendulum")
+    time, x = motion("pendulum", lambda t: np.full_like(t, 0.7))
+    rows = np.column_stack([time * 1000, np.degrees(x[:, 0]), x[:, 1]]).tolist()
+    lines = ["Time [ms];Angle (deg);thetadot", *(";".join(map(repr, row)).replace(".", ",") for row in rows)]
+    (tmp_path / "lab.csv").write_text("\n".join(lines))
+    said = Said()
+    assert replay_run(folder, tmp_path / "lab.csv", 0, said)
+    taken = "time from Time [ms] (times 0.001), theta from Angle (deg) (times 0.0174533), theta_dot from thetadot"
+    assert said.lines[0] == f"columns: {taken}"
+
+
+@pytest.mark.parametrize(("step", "count"), [(3.0, 0), (3.2, 1)])
+def test_half_a_turn_between_two_samples_looks_wrapped(tmp_path, step, count):
     path = tmp_path / "lab.csv"
     path.write_text(f"time,pos1,pos2,vel1,vel2\n0,0,0,0,0\n0.1,9,{step},0,0\n")
-    found = jumps(read_measured(path, 4), ["m", "rad", "m/s", "rad/s"])
-    assert len(found) == told
-    assert all("pos2 jumps by 3.2 rad at t = 0.1 s" in line for line in found)
-
-
-def test_the_columns_are_those_of_the_toolkits():
-    for plant, n in (("pendulum", 2), ("cartpole", 4)):
-        assert HEADS[plant].startswith(",".join(columns_of(n)))
+    found = jumps(read_measured(path, STATES["cartpole"]), STATES["cartpole"])
+    assert len(found) == count
+    assert all("theta jumps by 3.2 rad at t = 0.1 s" in line for line in found)

@@ -1,10 +1,12 @@
 """Finished run folders without a search: funnels of random ellipsoids, generations of known numbers."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import yaml
 
+from rtcd_jax.analysis.report.reading import Certificate, read_run
 from rtcd_jax.config import load as configuration
 from rtcd_jax.elite.records import FORMAT, VERSION, write_elite
 from rtcd_jax.system.files import plain, replace_json
@@ -22,11 +24,12 @@ SEARCHED_POLICY = {
     "authority": {"initial": 0.05, "min": 0.01, "max": 1.0}, "discount": {"initial": 0.5, "min": 0.0, "max": 2.0}
 }  # fmt: skip
 YAMLS = {"pendulum": configuration.EXAMPLE, "cartpole": CARTPOLE}
-CERTIFICATE = {
-    "elite": "000", "rung": "proved", "start": 0.0, "intervals": 6, "seconds": 7.25,
-    "sampled": {"inlet": 0.9, "sum": 333.0, "integral": 66.0, "goal": 1.0},
-    "found": {"inlet": 0.8, "sum": 330.0, "integral": 65.0, "outlet": 1.0, "goal": 1.0},
-}  # fmt: skip
+PROVED = Certificate(
+    "proved", "proved", "", start=0.0, intervals=6, seconds=7.25,
+    sampled={"inlet": 0.9, "sum": 333.0, "integral": 66.0, "goal": 1.0},
+    shown={"inlet": 0.8, "sum": 330.0, "integral": 65.0, "outlet": 1.0, "goal": 1.0},
+)  # fmt: skip
+"""As of a run whose elite 000 is proved; test_proofs.py has a real one."""
 VERIFICATION = {
     "states": 1020, "epsilon": 0.0043, "confidence": 0.99, "kept": True,
     "witnesses": {
@@ -53,17 +56,27 @@ def candidate(config, seed=0, scale=1.0, **changes):
     """A funnel as a run stores it: from start to goal, its ellipsoids random; the volumes are marks, not measured."""
     S, rho = random_values(len(config.task.start), seed)
     start, goal = np.array(config.task.start), np.array(config.task.goal)
-    per_knot = scale * np.geomspace(0.01, 10, KNOTS)
+    per_knot, n = scale * np.geomspace(0.01, 10, KNOTS), len(start)
     volumes = {"sum": 111.0, "integral": 22.0, "inlet": 0.3, "geometric_mean": 4.0}
     arrays = {
         "time": 0.1 * scale * np.arange(KNOTS),
         "x": start + (goal - start) * np.linspace(0, 1, KNOTS)[:, None],
+        "u": np.zeros((KNOTS - 1, 1)),
+        "K": np.zeros((KNOTS, 1, n)),
         "S": S,
         "rho": scale * rho,
+        "Q": np.eye(n),
+        "R": np.eye(1),
+        "K_goal": np.zeros((1, n)),
+        "x_goal": goal,
+        "u_max": np.ones(1),
         **{f"volumes_{name}": np.array(value * scale) for name, value in volumes.items()},
         "volumes_per_knot": per_knot,
     }
     record = {
+        "plant": config.plant.name,
+        "parameters": {},
+        "state_limits": [limit if np.isfinite(limit) else None for limit in config.task.state_limits],
         "status": "OK",
         "design": {name: variable.initial for name, variable in config.design.items()},
         "weights": {letter: [variable.initial for variable in found] for letter, found in config.weights},
@@ -113,10 +126,14 @@ def finished(path, plant="pendulum", scale=3.0, **changes):
     return run_folder(path, config, candidate(config), candidate(config, 1, scale))
 
 
-def prove_and_verify(path):
-    """What `rtcd certify`, `rtcd verify` and an experiment leave in the folder."""
+def proved(folder, **certificates):
+    """The run of a folder as if its elite 000 were proved."""
+    return replace(read_run(folder), certificates={"000": PROVED, **certificates})
+
+
+def verify_and_disturb(path):
+    """What `rtcd verify` and an experiment leave in the folder."""
     for place, name, record in (
-        ("certificates", "summary", {"000": CERTIFICATE}),
         ("verification", "000", VERIFICATION),
         ("disturbance", "off_nominal", {"summary": {"initial": {"success": 0.25}, "best": {"success": 0.75}}}),
     ):

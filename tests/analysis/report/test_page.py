@@ -11,7 +11,7 @@ from rtcd_jax.analysis.report.plots import plots
 from rtcd_jax.analysis.report.reading import compared, read_run
 from rtcd_jax.system.errors import UserError
 from tests.analysis.report import browser
-from tests.analysis.report.runs import candidate, experiment, finished, prove_and_verify, run_folder
+from tests.analysis.report.runs import candidate, experiment, finished, proved, run_folder, verify_and_disturb
 
 
 def written(tmp_path_factory, plants):
@@ -21,9 +21,9 @@ def written(tmp_path_factory, plants):
     for plant in plants:
         config = experiment(plant)
         elites = [candidate(config, seed, scale) for seed, scale in ((1, 3.0), (2, 2.0), (3, 10.0))]
-        run = prove_and_verify(run_folder(folder / plant, config, candidate(config), elites))
+        run = verify_and_disturb(run_folder(folder / plant, config, candidate(config), elites))
         pages[plant] = folder / f"{plant}.html"
-        pages[plant].write_text(render([read_run(run)]))
+        pages[plant].write_text(render([proved(run)]))
     runs = compared([read_run(finished(folder / name, scale=scale)) for name, scale in (("rtc", 2.0), ("rtcd", 5.0))])
     pages["both"] = folder / "both.html"
     pages["both"].write_text(render(runs))
@@ -135,7 +135,7 @@ def test_the_absence_of_an_initial_funnel_is_told(tmp_path):
 
 
 def test_pictures_of_an_experiment_are_in_the_page(tmp_path, pages):
-    run = prove_and_verify(finished(tmp_path / "run"))
+    run = verify_and_disturb(finished(tmp_path / "run"))
     (run / "disturbance" / "off_nominal_map.png").write_bytes(b"picture")
     assert '<img src="data:image/png;base64,cGljdHVyZQ=="' in render([read_run(run)])
     assert "<img" not in pages["pendulum"].read_text()
@@ -146,7 +146,7 @@ def test_a_page_that_is_there_is_brought_up_to_date_and_none_is_made(tmp_path):
     assert refresh(run) is None
     assert not (run / "report.html").exists()
     (run / "report.html").write_text(render([read_run(run)]))
-    prove_and_verify(run)
+    verify_and_disturb(run)
     assert refresh(run) == run / "report.html"
     assert (run / "report.html").read_text() == render([read_run(run)])
     assert "promises kept" in (run / "report.html").read_text()
@@ -161,7 +161,7 @@ def test_compared_searches_show_best_median_and_feasible_share_over_their_candid
     ]  # fmt: skip
     assert [line["y"] for line in data[3:]] == [[100.0, 101.0, 102.0], [60.0] * 3, [0.75] * 3]
     assert all(line["x"] == [4, 8, 12] for line in data)
-    assert {line["line"]["color"] for line in data[3:]} == {runs[1].best.color}
+    assert {line["line"]["color"] for line in data[3:]} == {runs[1].color}
 
 
 def test_one_run_gets_its_page_and_figures_several_get_one_beside_them(tmp_path, figures):

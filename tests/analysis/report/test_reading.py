@@ -8,20 +8,19 @@ import pytest
 from rtcd_jax.analysis.report.reading import compared, read_run, shown
 from rtcd_jax.system.errors import UserError
 from tests.analysis.report.runs import (
-    CERTIFICATE,
     VERIFICATION,
     candidate,
     experiment,
     finished,
-    prove_and_verify,
     run_folder,
+    verify_and_disturb,
 )
 
 
 def test_everything_in_the_folder_is_read(tmp_path):
-    run = read_run(prove_and_verify(finished(tmp_path / "mine")))
+    run = read_run(verify_and_disturb(finished(tmp_path / "mine")))
     assert run.name == "mine"
-    assert run.certificates == {"000": CERTIFICATE}
+    assert run.certificates == {}
     assert run.verification == {"000": VERIFICATION}
     assert [found.name for found in run.experiments] == ["off_nominal"]
     assert [funnel.label for funnel in run.funnels] == ["initial", "best"]
@@ -72,10 +71,11 @@ def test_what_is_no_finished_run_is_refused(tmp_path):
     with pytest.raises(UserError, match=r"000 has no funnel \(FUNNEL_EMPTY\)"):
         read_run(failed)
     arrays, record = candidate(config)
-    del arrays["rho"], arrays["volumes_inlet"], record["design"]
-    with pytest.raises(UserError, match="the best candidate lacks rho, volumes_inlet, design"):
+    del arrays["volumes_inlet"], record["design"]
+    with pytest.raises(UserError, match="the best candidate lacks volumes_inlet, design"):
         read_run(run_folder(tmp_path / "poor", config, best=(arrays, record)))
-    damaged = prove_and_verify(finished(tmp_path / "damaged"))
+    damaged = verify_and_disturb(finished(tmp_path / "damaged"))
+    (damaged / "certificates").mkdir()
     (damaged / "certificates" / "summary.json").write_text("{")
     with pytest.raises(UserError, match=r"cannot read .*summary.json: .*; remove it, or make it again"):
         read_run(damaged)

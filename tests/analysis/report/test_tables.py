@@ -2,6 +2,7 @@
 
 import json
 import math
+from dataclasses import replace
 
 import pytest
 
@@ -9,13 +10,14 @@ from rtcd_jax.analysis.report import tables
 from rtcd_jax.analysis.report.page import render
 from rtcd_jax.analysis.report.reading import Experiment, compared, read_run
 from tests.analysis.report.runs import (
-    CERTIFICATE,
+    PROVED,
     SEARCHED_POLICY,
     candidate,
     experiment,
     finished,
-    prove_and_verify,
+    proved,
     run_folder,
+    verify_and_disturb,
 )
 
 
@@ -25,9 +27,9 @@ def rows(table):
 
 
 def test_table_one_has_initial_optimal_ratio_and_time_with_every_number_s_rung(tmp_path):
-    folder = prove_and_verify(finished(tmp_path / "run"))
+    folder = finished(tmp_path / "run")
     (folder / "provenance.json").write_text(json.dumps({"starts": [{"seconds": 133.0}]}))
-    first, *others = rows(tables.gains([read_run(folder)]))
+    first, *others = rows(tables.gains([proved(folder)]))
     assert first == {
         "volume": "sum (searched)", "unit": "rad²/s", "initial": 111.0, "optimal": 333.0, "ratio": 3.0,
         "time": "2 min 13 s", "rung": "sampled",
@@ -35,9 +37,9 @@ def test_table_one_has_initial_optimal_ratio_and_time_with_every_number_s_rung(t
     assert [row["volume"] for row in others] == [
         "integral", "inlet", "geometric mean", "sum", "integral", "inlet",
     ]  # fmt: skip
-    proved = others[3]
-    assert (proved["optimal"], proved["rung"], proved["time"]) == (330.0, "proved", "7.25 s")
-    assert proved["initial"] is proved["ratio"] is None
+    shown = others[3]
+    assert (shown["optimal"], shown["rung"], shown["time"]) == (330.0, "proved", "7.25 s")
+    assert shown["initial"] is shown["ratio"] is None
 
 
 def test_without_an_initial_funnel_there_is_no_ratio(tmp_path):
@@ -59,42 +61,38 @@ def test_elites_are_told_with_designs_weights_volumes_and_rung(tmp_path):
     assert (first["sum × initial"], second["sum × initial"]) == (3, 2)
     assert {row["rung"] for row in (first, second)} == {"sampled"}
     assert "sum shown" not in first
-    prove_and_verify(folder)
-    first, second = rows(tables.elites(read_run(folder)))
+    first, second = rows(tables.elites(proved(folder)))
     assert (first["sum shown"], first["rung shown"], second["sum shown"]) == (330.0, "proved", None)
 
 
 def test_certificates_stand_beside_what_was_sampled(tmp_path):
     folder = finished(tmp_path / "run")
     assert tables.certificates([read_run(folder)]) is None
-    prove_and_verify(folder)
-    summary = {"000": CERTIFICATE, "001": None}
-    (folder / "certificates" / "summary.json").write_text(json.dumps(summary))
-    first, second = rows(tables.certificates([read_run(folder)]))
+    (folder / "certificates").mkdir()
+    (folder / "certificates" / "summary.json").write_text('{"001": null}')
+    first, second = rows(tables.certificates([proved(folder, **read_run(folder).certificates)]))
     assert (first["sum sampled"], first["sum shown"], first["rung"]) == (333, 330, "proved")
     assert math.isclose(first["sum shown / sampled"], 330 / 333)
-    assert second["rung"] == "no goal region could be shown"
+    assert second["rung"] == "none: no goal region could be shown"
 
 
 @pytest.mark.parametrize(
-    ("sampled", "proved", "ranks"),
+    ("sampled", "shown", "ranks"),
     [((1, 2), (1, 2), None), ((1, 2, 3), (10, 20, 30), (1.0, 3)), ((1, 2, 3), (3, 2, 1), (-1.0, 3))],
 )
-def test_ranks_agree_from_three_elites_on(tmp_path, sampled, proved, ranks):
-    folder = prove_and_verify(finished(tmp_path / "run"))
+def test_ranks_agree_from_three_elites_on(tmp_path, sampled, shown, ranks):
     told = {
-        f"{i:03d}": CERTIFICATE | {"sampled": {"sum": a}, "found": {"sum": b}}
-        for i, (a, b) in enumerate(zip(sampled, proved, strict=True))
+        f"{i:03d}": replace(PROVED, sampled={"sum": a}, shown={"sum": b})
+        for i, (a, b) in enumerate(zip(sampled, shown, strict=True))
     }
-    (folder / "certificates" / "summary.json").write_text(json.dumps(told))
-    found = tables.ranks(read_run(folder))
+    found = tables.ranks(proved(finished(tmp_path / "run"), **told))
     assert found is ranks or found == pytest.approx(ranks)
 
 
 def test_verification_tells_what_each_witness_saw(tmp_path):
     folder = finished(tmp_path / "run")
     assert tables.verification([read_run(folder)]) is None
-    (row,) = rows(tables.verification([read_run(prove_and_verify(folder))]))
+    (row,) = rows(tables.verification([read_run(verify_and_disturb(folder))]))
     assert (row["funnel"], row["witness"], row["states"], row["promise"]) == ("000", "C MuJoCo", 1020, "kept")
     assert (row["at most"], row["promised"], row["confidence"]) == (0.0045, 0.0043, 0.99)
 
@@ -115,8 +113,8 @@ def test_an_experiment_is_told_as_it_is(summary, heads, told):
 
 
 def test_runs_are_compared_row_by_row(tmp_path):
-    folders = [prove_and_verify(finished(tmp_path / "rtc", scale=2.0)), finished(tmp_path / "rtcd", scale=5.0)]
-    first, second = rows(tables.comparison(compared([read_run(folder) for folder in folders])))
+    folders = [verify_and_disturb(finished(tmp_path / "rtc", scale=2.0)), finished(tmp_path / "rtcd", scale=5.0)]
+    first, second = rows(tables.comparison(compared([proved(folders[0]), read_run(folders[1])])))
     assert (first["run"], first["sum"], first["sum × initial"], first["sum shown"]) == ("rtc", 222, 2, 330)
     assert (second["run"], second["sum"], second["sum × initial"], second["sum shown"]) == ("rtcd", 555, 5, None)
     assert (first["promise"], second["promise"]) == ("kept", None)

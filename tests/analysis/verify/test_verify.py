@@ -15,10 +15,10 @@ from scipy.linalg import solve_continuous_are
 
 from rtcd_jax.analysis.verify.run import verify_run
 from rtcd_jax.analysis.verify.verification import clopper_pearson, verify_funnel
-from rtcd_jax.elite.closed_loop import simulate, tracking
+from rtcd_jax.elite.closed_loop import ClosedLoop, simulate
 from rtcd_jax.elite.elite import Elite
 from rtcd_jax.elite.records import write_elite
-from rtcd_jax.elite.simulators import witnesses
+from rtcd_jax.elite.simulators import simulators_of
 from rtcd_jax.plants.mjx import model_of
 from rtcd_jax.system.errors import UserError
 
@@ -48,6 +48,7 @@ def _held(level: float, knots: int = 6) -> Elite:
     return Elite(
         plant="pendulum",
         parameters=PARAMETERS,
+        guarantee="sampled",
         epsilon=0.05,
         confidence=0.99,
         time=0.05 * np.arange(knots),
@@ -56,10 +57,13 @@ def _held(level: float, knots: int = 6) -> Elite:
         K=np.tile(gain, (knots, 1, 1)),
         S=np.tile(value, (knots, 1, 1)),
         rho=np.full(knots, level),
+        Q=np.diag([10.0, 1.0]),
+        R=np.array([[0.1]]),
         K_goal=gain,
         x_goal=UPRIGHT,
         u_max=np.array([2.5]),
         state_limits=np.array([2 * np.pi, 7.0]),
+        volumes_per_knot=np.full(knots, np.pi * level / np.sqrt(np.linalg.det(value))),
     )
 
 
@@ -93,7 +97,9 @@ def _oracle(elite: Elite, k: int, x: np.ndarray) -> np.ndarray:
 
 def _outcomes(elite: Elite, knots, states):
     states = np.atleast_2d(np.asarray(states, float))
-    return [simulate(elite, f, march, np.asarray(knots), states) for _, f, march, _ in witnesses(elite, len(states))]
+    return [
+        simulate(elite, f, march, np.asarray(knots), states) for _, f, march, _ in simulators_of(elite, len(states))
+    ]
 
 
 def test_a_small_funnel_about_the_upright_keeps_its_promise():
@@ -129,11 +135,11 @@ def test_the_witnesses_agree_on_every_state(level):
 def test_an_interval_under_the_loop_is_that_of_its_definition(witness, smooth, kinked):
     """The last state crosses the torque limit inside a step: there a method of any order is one of the second."""
     elite = _moving()
-    _, f, march, _ = list(witnesses(elite, 4))[witness]
+    _, f, march, _ = list(simulators_of(elite, 4))[witness]
     offsets = np.array([[0.0, 0.0], [0.05, -0.1], [-0.1, 0.2], [0.6, 1.0]])
     tolerances = np.array([smooth, smooth, smooth, kinked])[:, None]
     for k in range(len(elite.u)):
-        policy = tracking(elite, f, k)
+        policy = ClosedLoop.of(elite, f).tracking(k)
         start, end = elite.time[k : k + 2]
         *_, reached = march(policy, start, end, elite.x[k] + offsets)
         expected = np.array([_oracle(elite, k, x) for x in elite.x[k] + offsets])
@@ -155,8 +161,8 @@ def test_mujocos_own_steps_with_held_inputs_converge_to_the_loop():
             mujoco.mj_step(model, data)
         return np.concatenate([data.qpos, data.qvel])
 
-    _, f, march, _ = next(witnesses(elite, 1))
-    *_, end = march(tracking(elite, f, 0), 0.0, 0.05, x0[None])
+    _, f, march, _ = next(simulators_of(elite, 1))
+    *_, end = march(ClosedLoop.of(elite, f).tracking(0), 0.0, 0.05, x0[None])
     coarse, fine = (np.linalg.norm(stepped(steps) - end[0]) for steps in (200, 400))
     assert fine < 1e-3
     assert coarse / fine == pytest.approx(2, rel=0.02)
@@ -250,11 +256,16 @@ class _Listener:
 
 
 def _store(folder, name: str, elite: Elite, **changes) -> None:
-    stored = dataclasses.asdict(elite)
-    record = {key: stored.pop(key) for key in ("plant", "parameters", "epsilon", "confidence")}
-    limits = [limit if np.isfinite(limit) else None for limit in stored.pop("state_limits")]
+    record = {key: getattr(elite, key) for key in ("plant", "parameters", "epsilon", "confidence")}
+    limits = [limit if np.isfinite(limit) else None for limit in elite.state_limits]
     folder.mkdir(parents=True, exist_ok=True)
-    write_elite(folder, name, stored, record | {"state_limits": limits, "status": "OK"} | changes)
+    promise = {"state_limits": limits, "status": "OK", "rung": elite.guarantee}
+    write_elite(folder, name, _arrays(elite), record | promise | changes)
+
+
+def _arrays(elite: Elite) -> dict[str, np.ndarray]:
+    values = ((field.name, getattr(elite, field.name)) for field in dataclasses.fields(elite))
+    return {name: value for name, value in values if isinstance(value, np.ndarray) and name != "state_limits"}
 
 
 def test_verify_run_stores_what_it_found_and_tells_it(tmp_path):
@@ -379,13 +390,6 @@ def test_an_elite_without_a_funnel_is_refused(changes, message):
 
 
 def test_an_elite_that_lacks_something_says_what():
-    stored = dataclasses.asdict(_held(HELD))
-    with pytest.raises(UserError, match="the elite lacks epsilon, rho, state_limits"):
-        Elite.of(
-            {
-                key: value
-                for key, value in stored.items()
-                if isinstance(value, np.ndarray) and key not in ("rho", "state_limits")
-            },
-            {"plant": "pendulum", "parameters": PARAMETERS, "confidence": 0.9},
-        )
+    arrays = {name: array for name, array in _arrays(_held(HELD)).items() if name != "rho"}
+    with pytest.raises(UserError, match="the elite lacks rung, epsilon, rho, state_limits"):
+        Elite.of(arrays, {"plant": "pendulum", "parameters": PARAMETERS, "confidence": 0.9})

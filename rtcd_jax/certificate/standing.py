@@ -1,0 +1,182 @@
+"""Does a stored certificate prove a stored elite? The one answer that reports and exports give.
+
+It does if the checker accepts the very file, and if the closed loop that the file claims is the elite's: plant,
+parameters, limits, dt, x, u, K, x_goal and K_goal bit by bit, and the rates to within their rounding.
+
+Checking takes seconds, so that verdicts are remembered: in the user's own cache, by the digests of the file and of
+the checker's source. A run folder may come from anybody; no verdict is read from it.
+"""
+
+import hashlib
+import json
+import os
+from collections.abc import Callable, Mapping
+from contextlib import suppress
+from dataclasses import asdict, dataclass, field
+from functools import cache
+from pathlib import Path
+from typing import Any, Literal, final
+
+import numpy as np
+
+from rtcd_jax.certificate import check
+from rtcd_jax.certificate.check import Damaged, Node, Refused, Report, Undecided
+from rtcd_jax.certificate.prove.closed_loop import claim_of
+from rtcd_jax.elite.elite import Elite
+from rtcd_jax.system.errors import UserError
+from rtcd_jax.system.files import replace_json
+
+RATE_ROUNDING = 1e-12
+"""Share of the largest rate by which another machine's sine may change one."""
+
+Verdict = Literal["proved", "missing", "damaged", "of another elite", "refused", "undecided"]
+
+
+@final
+@dataclass(frozen=True)
+class Standing:
+    """What an elite's certificate is worth. Only where `proved` are the numbers below more than their defaults.
+
+    `reason` says what is missing to a proof. `claim` is the SHA-256 of the claim as `rtcd check` prints it, `sha256`
+    that of the file; from `start` [s] on, in so many intervals, the `volumes` are proved by name.
+    """
+
+    verdict: Verdict
+    reason: str = ""
+    claim: str = ""
+    sha256: str = ""
+    start: float = 0.0
+    intervals: int = 0
+    volumes: Mapping[str, float] = field(default_factory=dict)
+
+    @property
+    def proved(self) -> bool:
+        return self.verdict == "proved"
+
+
+def certificate_path(run: Path, name: str) -> Path:
+    """Where a run folder keeps the certificate of an elite."""
+    return run / "certificates" / f"{name}.json"
+
+
+def standing(run: Path, name: str, progress: Callable[[int, int], None] = lambda done, of: None) -> Standing:
+    """What `certificates/NAME.json` of a run folder is worth for the folder's elite NAME.
+
+    `progress(done, of)` is told the intervals while the checker runs.
+
+    Raises:
+        UserError: the elite cannot be read.
+    """
+    if not certificate_path(run, name).is_file():
+        return Standing("missing", f"{certificate_path(run, name)} is not there")
+    return standing_of(certificate_path(run, name), Elite.read(run, name), progress)
+
+
+def standing_of(
+    path: Path,
+    elite: Elite,
+    progress: Callable[[int, int], None] = lambda done, of: None,
+) -> Standing:
+    """What the certificate at `path` is worth for an elite."""
+    try:
+        file = check.read_bytes(path)
+        content = check.parse(file)
+        check.read_claim(Node("certificate.claim", content["claim"]))
+    except OSError as error:
+        return Standing("missing", f"{path}: {error.strerror}")
+    except Undecided as undecided:
+        return Standing("undecided", f"{path}: {undecided}")
+    except (Refused, KeyError, TypeError) as error:
+        return Standing("damaged", f"{path} is no certificate: {error}")
+    try:
+        other = difference(content["claim"], claim_of(elite))
+    except UserError as error:
+        other = str(error)
+    if other:
+        return Standing("of another elite", f"{path} is of another elite: {other}")
+    digest = hashlib.sha256(file).hexdigest()
+    return _remembered(digest) or _checked(content, digest, progress)
+
+
+def difference(claimed: Mapping[str, Any], stored: Mapping[str, Any]) -> str:
+    """The first number of a certificate's claim that is not the stored elite's, with both; empty if there is none."""
+    largest = np.max(np.abs([float.fromhex(rate) for rate in np.ravel(stored["rates"])]))
+    for key in sorted(stored, key="rates".__eq__):  # the rates last: they follow from the others
+        told = _difference(key, claimed[key], stored[key], RATE_ROUNDING * largest if key == "rates" else 0.0)
+        if told:
+            return told
+    return ""
+
+
+def _difference(place: str, claimed: Any, stored: Any, tolerance: float) -> str:
+    if isinstance(stored, dict):
+        pairs = [(f"{place}.{key}", claimed[key], value) for key, value in stored.items()]
+    elif isinstance(stored, list):
+        if len(claimed) != len(stored):
+            return f"{place} has {len(claimed)} entries there, {len(stored)} in the elite"
+        pairs = [(f"{place}[{i}]", *both) for i, both in enumerate(zip(claimed, stored, strict=True))]
+    elif claimed == stored:
+        return ""
+    elif place == "plant" or claimed is None or stored is None:
+        return f"{place} is {_told(place, claimed)} there, {_told(place, stored)} in the elite"
+    else:
+        theirs, ours = float.fromhex(claimed), float.fromhex(stored)
+        return "" if abs(theirs - ours) <= tolerance else f"{place} = {theirs!r} there, {ours!r} in the elite"
+    return next(filter(None, (_difference(*pair, tolerance) for pair in pairs)), "")
+
+
+def _told(place: str, value: Any) -> str:
+    return "none" if value is None else repr(value if place == "plant" else float.fromhex(value))
+
+
+def _checked(content: Any, digest: str, progress: Callable[[int, int], None]) -> Standing:
+    """The checker's verdict on a file of this digest."""
+    try:
+        with check.within(check.SECONDS):
+            return remember(digest, accepted(check.check(content, progress), digest))
+    except Undecided as undecided:
+        return Standing("undecided", str(undecided))
+    except Damaged as damaged:
+        return remember(digest, Standing("damaged", str(damaged)))
+    except Refused as refused:
+        return remember(digest, Standing("refused", str(refused)))
+
+
+def accepted(report: Report, digest: str) -> Standing:
+    """A proof: what the checker reports of a file of this digest."""
+    return Standing("proved", "", report.digest, digest, report.start, report.stretches, report.volumes)
+
+
+# The cache ------------------------------------------------------------------------------------------------------------
+
+
+def remember(digest: str, found: Standing) -> Standing:
+    """Keeps the checker's verdict on a file of this digest, where the user has a cache; the same verdict."""
+    path = _cached(digest)
+    with suppress(UserError, OSError):  # a home that cannot be written costs time, no more
+        path.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
+        replace_json(path, asdict(found))
+    return found
+
+
+def _remembered(digest: str) -> Standing | None:
+    with suppress(OSError, ValueError, TypeError):
+        return Standing(**json.loads(_cached(digest).read_bytes()))
+    return None
+
+
+def _cached(digest: str) -> Path:
+    """In `$XDG_CACHE_HOME`, by default ~/.cache."""
+    given = Path(os.environ.get("XDG_CACHE_HOME", ""))
+    folder = given if given.is_absolute() else Path(os.path.expanduser("~/.cache"))
+    return folder / "rtcd_jax" / "verdicts" / f"{digest}-{checker_digest()}.json"
+
+
+@cache
+def checker_digest() -> str:
+    """The SHA-256 of the checker's source: another checker decides anew."""
+    total = hashlib.sha256()
+    for source in sorted(Path(check.__file__).parent.glob("*.py")):
+        content = source.read_bytes()
+        total.update(f"{source.name} {len(content)}\n".encode() + content)
+    return total.hexdigest()
