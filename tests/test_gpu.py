@@ -18,6 +18,7 @@ from rtcd_jax.evaluation import elite_effort, make_evaluate, resample
 from rtcd_jax.numerics.loops import compiled_for
 from rtcd_jax.problem import make_problem
 from rtcd_jax.search import cmaes
+from tests.analysis.disturb import comparisons
 from tests.paths import CONFIGS
 
 ON_DEVICE = {"cusolver_syevd_ffi", "Sharding", "SPMDFullToShardShape", "SPMDShardToFullShape"}
@@ -33,6 +34,11 @@ def lowered(function, *arguments):
 def calls(program):
     """Everything that the program asks of somebody else."""
     return set(re.findall(r"custom_call @([\w$.]+)", program)) - ON_DEVICE
+
+
+@pytest.fixture(scope="module")
+def robots(tmp_path_factory):
+    return comparisons.contest(tmp_path_factory.mktemp("robots") / "run", "pendulum")
 
 
 @pytest.fixture(scope="module", params=["pendulum", pytest.param("cartpole", marks=pytest.mark.slow)])
@@ -55,5 +61,18 @@ def test_a_generation_and_an_elite_ask_nothing_of_the_host(problem):
     assert calls(lowered(lambda evaluation, key: again(evaluation, wrapped(key)), one, key)) == set()
 
 
-def test_a_generation_asks_and_tells_on_the_device():
+def test_the_search_asks_and_tells_on_the_device():
     strategy = cmaes.Strategy(5, 128, 0.3)
+    state = jax.eval_shape(partial(cmaes.start, strategy), np.full(5, 0.5))
+    key = jax.random.key_data(jax.random.key(0))
+    ask = lowered(lambda state, key: cmaes.ask(strategy, state, jax.random.wrap_key_data(key)), state, key)
+    tell = lowered(partial(cmaes.tell, strategy), state, np.zeros((128, 5)), np.zeros(128))
+    assert calls(ask) | calls(tell) == set()
+
+
+def test_disturbed_motions_ask_nothing_of_the_host(robots):
+    lanes = scenarios.undisturbed(robots.plant, robots.design, np.zeros(64, int), np.zeros((robots.plant.n, 64)))
+    motion = scenarios.start(robots.loops, lanes)
+    with compiled_for("cuda"):
+        traced = scenarios.advance.trace(robots.loops, lanes, motion, jnp.asarray(0), jax.random.key(0))
+        assert calls(traced.lower(lowering_platforms=("cuda",)).as_text()) == set()

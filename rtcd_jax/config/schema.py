@@ -287,11 +287,8 @@ class SearchConfig(Settings):
     )
     sigma: float = Field(default=0.3, ge=1e-6, le=1, description="initial step size in the unit box [-]")
     seed: int = Field(default=0, ge=0, lt=2**32, description="of all random numbers [-]")
-    chunk: int = Field(
-        default=64,
-        ge=1,
-        le=2**20,
-        description="candidates that a device evaluates at once, which bounds its memory [-]",
+    chunk: Annotated[int, Field(ge=1, le=2**20)] | Literal["auto"] = Field(
+        default="auto", description="candidates that a device is given at once; auto: as many as its memory holds [-]"
     )
     nested: NestedConfig = Field(
         default=NestedConfig(), description="budget of the two loops, used in mode nested alone"

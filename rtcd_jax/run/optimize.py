@@ -12,7 +12,7 @@ import numpy as np
 
 from rtcd_jax.config.load import Config
 from rtcd_jax.elite.records import elite_names
-from rtcd_jax.evaluation import elite_effort, make_evaluate, resample
+from rtcd_jax.evaluation import device_chunk, elite_effort, make_evaluate, resample
 from rtcd_jax.genome import initial_genome
 from rtcd_jax.problem import Problem, make_problem
 from rtcd_jax.run.folder import RunFolder
@@ -39,7 +39,8 @@ def optimize(config: Config, folder: Path, console: Console, cluster: Cluster) -
         Preempted: the system asked to stop; the folder has all that was done.
     """
     problem = make_problem(config)
-    chunk = min(config.search.chunk, -(-config.search.population // len(cluster.devices)))
+    share = -(-config.search.population // len(cluster.devices))
+    chunk = device_chunk(problem, share, cluster.memory)
     evaluate = spread(make_evaluate(problem), cluster, chunk)
     plan = search.Plan(config.search, config.elites, tuple(initial_genome(problem).tolist()), problem.design_dims)
     genomes = jnp.zeros((config.search.population, len(problem.free)))

@@ -17,6 +17,7 @@ import numpy as np
 from jax.experimental import multihost_utils
 from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec
 
+from rtcd_jax.system.devices import memory_of
 from rtcd_jax.system.errors import UserError
 
 HEARTBEAT = 30
@@ -77,6 +78,11 @@ class Cluster:
             raise UserError(f"--devices = {limit}: this process sees {have} devices")
         chosen = (device for process in range(jax.process_count()) for device in jax.local_devices(process)[:limit])
         return cls(tuple(chosen))
+
+    @property
+    def memory(self) -> float:
+        """What a device has [bytes], as process 0 sees its own."""
+        return float(self.agreed(np.asarray(memory_of(jax.local_devices()[0]))))
 
     @property
     def processes(self) -> int:

@@ -31,7 +31,7 @@ def measure(path: Path, population: int, devices: int, repeats: int) -> dict[str
 
     from rtcd_jax.analysis.scale.clock import peak_memory, timed
     from rtcd_jax.config.load import load
-    from rtcd_jax.evaluation import make_evaluate
+    from rtcd_jax.evaluation import device_chunk, make_evaluate
     from rtcd_jax.genome import initial_genome
     from rtcd_jax.problem import make_problem
     from rtcd_jax.run.folder import RunFolder
@@ -43,7 +43,7 @@ def measure(path: Path, population: int, devices: int, repeats: int) -> dict[str
     settings = config.search.model_copy(update={"population": population, "mode": "joint"})
     config = config.model_copy(update={"search": settings})
     problem, cluster = make_problem(config), Cluster.of(devices)
-    chunk = min(settings.chunk, -(-population // devices))
+    chunk = device_chunk(problem, -(-population // devices), cluster.memory)
     spread_out, evaluations = spread(make_evaluate(problem), cluster, chunk), []
 
     def evaluate(genomes, key):
