@@ -4,15 +4,11 @@ Of every knot's ellipsoid, uniform random states are followed to the last knot u
 own controller, u = clip(u_k - R^-1 B'S (x - x*(t))): an invariant funnel lets none out.
 """
 
-import io
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
-from rich.box import SIMPLE
-from rich.console import Console as Terminal
-from rich.table import Table
 
 from rtcd_jax.certificate.audit.external import Cost, Outside, elite_of
 from rtcd_jax.certificate.audit.repair import defects, repaired
@@ -20,7 +16,7 @@ from rtcd_jax.elite.closed_loop import ClosedLoop, runge_kutta
 from rtcd_jax.elite.elite import Elite
 from rtcd_jax.elite.records import write_elite
 from rtcd_jax.elite.simulators import CLOSED_FORMS
-from rtcd_jax.system.console import Console
+from rtcd_jax.system.console import Console, table
 from rtcd_jax.system.errors import UserError
 from rtcd_jax.system.files import make_folder, replace_json
 
@@ -99,18 +95,16 @@ def _record(given: Outside, mended: Outside, seen: Escapes, off: np.ndarray, sta
 
 
 def _table(given: Outside, seen: Escapes) -> str:
-    table = Table(box=SIMPLE, title="the funnel as given, true dynamics: its first and its worst knots")
-    for heading in ("knot", "t, s", "leave the next", "worst V/rho there", "leave later", "worst V/rho"):
-        table.add_column(heading, justify="right")
     worst = np.argsort(-seen.next_share, kind="stable")[:WORST]
-    for k in [0, *sorted(int(k) for k in worst if k)]:
-        table.add_row(
+    rows = [
+        (
             f"{k}", f"{k * given.dt:.3g}", f"{seen.next_share[k]:.1%}", f"{seen.next_level[k]:.3g}",
             f"{seen.share[k]:.1%}", f"{seen.level[k]:.3g}",
-        )  # fmt: skip
-    text = io.StringIO()
-    Terminal(file=text, width=132).print(table)
-    return text.getvalue().rstrip()
+        )
+        for k in [0, *sorted(int(k) for k in worst if k)]
+    ]  # fmt: skip
+    headings = ("knot", "t, s", "leave the next", "worst V/rho there", "leave later", "worst V/rho")
+    return table(headings, rows, "the funnel as given, true dynamics: its first and its worst knots")
 
 
 def _summary(given: Outside, mended: Outside, seen: Escapes, off: np.ndarray, states: int) -> str:
