@@ -131,8 +131,7 @@ def test_an_initial_candidate_without_a_funnel_is_left_out(tmp_path):
     write_elite(folder, "initial", arrays, record | {"status": "FUNNEL_EMPTY"})
     screen = Screen()
     assert read_contest(folder, screen.console).names == ("best",)
-    assert screen.text == "the initial candidate has no funnel (FUNNEL_EMPTY): the best elite is disturbed alone
-"
+    assert screen.text == "the initial candidate has no funnel (FUNNEL_EMPTY): the best elite is disturbed alone\n"
 
 
 def test_a_run_without_elites_is_refused(tmp_path):
