@@ -21,7 +21,7 @@ from rtcd_jax.elite.records import (
     read_elite,
     read_generations,
 )
-from rtcd_jax.system.console import Console, silent
+from rtcd_jax.system.console import Console, Progress, silent
 from rtcd_jax.system.errors import UserError
 from rtcd_jax.system.files import read_json, reading
 
@@ -76,19 +76,6 @@ class Certificate:
     seconds: float = 0.0
     sampled: Mapping[str, float] = field(default_factory=dict)
     shown: Mapping[str, float] = field(default_factory=dict)
-
-
-@final
-@dataclass(frozen=True)
-class Checking:
-    """How far the checker is with a certificate, in intervals."""
-
-    file: Path
-    done: int
-    total: int
-
-    def __str__(self) -> str:
-        return f"checking {self.file}  interval {self.done}/{self.total}"
 
 
 @final
@@ -246,7 +233,7 @@ def _telling(console: Console, file: Path) -> Callable[[int, int], None]:
         nonlocal told
         if time.monotonic() - told >= 1:
             told = time.monotonic()
-            console.progress(Checking(file, done, of))
+            console.progress(Progress(done, of, f"checking {file}  interval {done}/{of}"))
 
     return progress
 
