@@ -58,8 +58,7 @@ class Small:
         self.environment = cache | os.environ | devices
 
     def start(self, verb: str, *arguments) -> subprocess.Popen:
-        code = "import sys; from rtcd_jax.cli.main import main; sys.exit(main(sys.argv[1:]))"
-        command = [sys.executable, "-u", "-c", code, verb, *map(str, arguments)]
+        command = [sys.executable, "-u", "-m", "rtcd_jax", verb, *map(str, arguments)]
         pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
         return subprocess.Popen(command, cwd=ROOT, env=self.environment, **pipes)
 
