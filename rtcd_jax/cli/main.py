@@ -151,7 +151,7 @@ def _finish_page(run: Path, changed: bool, console: Any) -> None:
     from rtcd_jax.analysis.report import report
 
     try:
-        page, *figures = report([run])
+        page, *figures = report([run], console=console)
     except Exception as error:
         console.message(f"the run is finished, but its report failed: {error!r}; `rtcd report {run}` makes it")
     else:
@@ -181,15 +181,10 @@ def replay(arguments: Sequence[str]) -> int:
     from rtcd_jax.system.console import Console
 
     with Console() as console:
-<<<<<<< HEAD
         kept = replay_run(
             options.run, options.file, options.elite, console, options.columns, options.start, options.unwrap
         )
-    return OK if kept else BROKEN_PROMISE
-=======
-        kept = replay_run(options.run, options.file, options.elite, console)
     return Exit.OK if kept else Exit.REFUTED
->>>>>>> 5c20802 (Unexpected errors end with 70 and one line, Ctrl-C ends every command within two seconds, closed and narrow streams end in no traceback)
 
 
 def certify(arguments: Sequence[str]) -> int:

@@ -168,7 +168,7 @@ def run_module(monkeypatch):
     module.optimize = lambda config, folder, console, cluster: calls.append((config, folder)) or True
     monkeypatch.setitem(sys.modules, "rtcd_jax.run.optimize", module)
     monkeypatch.setattr(cli, "prepare_jax", lambda *_: None)
-    monkeypatch.setattr("rtcd_jax.analysis.report.report", lambda folders: (folders[0] / "report.html",) * 2)
+    monkeypatch.setattr("rtcd_jax.analysis.report.report", lambda folders, **_: (folders[0] / "report.html",) * 2)
     monkeypatch.setattr("rtcd_jax.system.cluster.Cluster.heed", lambda cluster: None)  # signals stay pytest's
     module.calls = calls
     return module
@@ -245,7 +245,7 @@ def test_a_page_that_cannot_be_brought_up_to_date_ends_nothing(monkeypatch, tmp_
 def test_a_failing_report_ends_nothing(run_module, tmp_path, monkeypatch, capsys):
     """The run is finished; what went wrong is told, with the command that tries again."""
 
-    def broken(_):
+    def broken(*_, **__):
         raise RuntimeError("no fonts")
 
     monkeypatch.setattr("rtcd_jax.analysis.report.report", broken)
