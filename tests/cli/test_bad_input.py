@@ -177,7 +177,7 @@ OTHERS = {
     ),
     "no measured file": (["replay", "run", "no.csv"], "no.csv: no such file; must be a CSV of measured states"),
     "a folder, measured": (["replay", "run", "run"], "run: is a folder; must be a CSV of measured states"),
-    "no such elite": (["replay", "run", "measured.csv", "--elite", "7"], "run/elites has no 007.npz with its 007.json"),
+    "no such elite": (["replay", "run", "measured.csv", "--elite", "7"], "run has no elite 007; there are 000"),
     "no elite to export": (["export", "run", "--to", "lab", "--elite", "7"], "run has no elite 007; there are 000"),
     "a file to export to": (["export", "run", "--to", "measured.csv"], "measured.csv is a file: an export needs a"),
     "a run to export to": (["export", "run", "--to", "run"], "run is not empty and no former export: it has .lock"),
