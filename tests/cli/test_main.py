@@ -280,7 +280,9 @@ def test_what_is_no_run_folder_is_told_in_one_line(verb, arguments, tmp_path, ca
 def test_help_has_an_example(verb, capsys):
     with contextlib.suppress(SystemExit):
         assert cli.main([verb, "--help"]) == 0
-    assert f"Example: rtcd {verb} " in flat(capsys.readouterr().out)
+    text = flat(capsys.readouterr().out)
+    assert f"Example: rtcd {verb} " in text
+    assert "None" not in text  # but what holds where an option is left away
 
 
 def _standing_in(monkeypatch, name, verb):
