@@ -252,18 +252,18 @@ def falsify(arguments: Sequence[str]) -> int:
 
 
 def audit(arguments: Sequence[str]) -> int:
-    """show where a funnel from outside fails, and mend its nominal for a proof"""
+    """show where an external funnel fails, and project its nominal onto the dynamics for a proof"""
     from rtcd_jax.cli.proof_options import read_audit
 
     options = read_audit(arguments)
-    from rtcd_jax.certificate.audit.audit import audit as run_audit
-    from rtcd_jax.certificate.audit.external import Cost, read_outside
+    from rtcd_jax.certificate.audit.audit import audit_funnel
+    from rtcd_jax.certificate.audit.external import Cost, read_external
     from rtcd_jax.system.console import Console
 
-    given = read_outside(options.file, options.plant, options.numbers)
+    given = read_external(options.file, options.plant, options.numbers, options.funnel)
     cost = Cost.of(given, options.q, options.r, options.state_limits)
     with Console() as console:
-        held = run_audit(given, cost, options.states, options.seed, options.out, console)
+        held = audit_funnel(given, cost, options.states, options.seed, options.out, console)
     return Exit.OK if held else Exit.REFUTED
 
 

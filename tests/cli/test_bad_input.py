@@ -186,8 +186,8 @@ OTHERS = {
     "nothing to check": (["check"], "0 files: must be one, as in `rtcd check"),
     "nothing to falsify": (["falsify", "run"], "run/certificates/000.json: No such file"),
     "no certificate to falsify": (["falsify", "measured.csv"], "measured.csv is no certificate"),
-    "no table": (["audit", "no.csv", *ARGUMENTS, "--out", "out"], "no.csv: No such file"),
-    "a folder for a table": (["audit", "run", *ARGUMENTS, "--out", "out"], "run: Is a directory"),
+    "no table": (["audit", "no.csv", *ARGUMENTS, "--out", "out"], "no.csv: no such file"),
+    "a folder for a table": (["audit", "run", *ARGUMENTS, "--out", "out"], "run: is a folder"),
     "too few columns": (["audit", "measured.csv", *ARGUMENTS, "--out", "out"], "measured.csv: must have at least"),
     "too few parameters": (
         ["audit", "measured.csv", *ARGUMENTS, "--parameters", "m=1", "--out", "out"],

@@ -33,6 +33,9 @@ INITIALS = (BLUE, "#5F6B7A", "#8C6D31", "#7A5195")
 """Of their initial candidates, where they differ."""
 
 _ADVICE = "remove it, or make it again"
+AUDIT = "audit.json"
+"""In the folders that `rtcd audit` makes."""
+
 _OF_A_GENERATION = (
     "index", "evaluations", "objective", "best", "median", "best_so_far", "feasible", "counts", "sigma", "restarts",
     "genomes", "volumes",
@@ -153,8 +156,13 @@ def _require_shown(name: str, elite: Elite) -> None:
 
 
 def read_search(path: Path) -> list[dict[str, Any]]:
-    """The generations of a run. Raises UserError if there are none."""
+    """The generations of a run, none of an audited funnel, which nobody searched.
+
+    Raises UserError if others have none.
+    """
     generations = read_generations(path) if (path / "generations.jsonl").is_file() else []
+    if not generations and (path / AUDIT).is_file():
+        return []
     if not generations:
         raise UserError(f"{path} has no generations yet: begin the run first")
     for number, record in enumerate(generations, 1):
