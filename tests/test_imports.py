@@ -33,7 +33,7 @@ OWNERS = {
     "flint": {"certificate"},
     "orbax": {"run"},
     "evosax": {"search"},
-    "rich": {"system.console", "run.sweep", "analysis", "certificate"},
+    "rich": {"system.console"},
     "tyro": {"cli"},
     "yaml": {"config", "export"},
     "matplotlib": {"analysis"},

@@ -86,7 +86,7 @@ def standing_of(
         return Standing("missing", f"{path}: {error.strerror}")
     except Undecided as undecided:
         return Standing("undecided", f"{path}: {undecided}")
-    except (Refused, KeyError, TypeError) as error:
+    except (Refused, KeyError, TypeError, RecursionError) as error:
         return Standing("damaged", f"{path} is no certificate: {error}")
     try:
         other = difference(content["claim"], claim_of(elite))

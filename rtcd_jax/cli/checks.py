@@ -3,7 +3,14 @@
 from pathlib import Path
 from typing import Any
 
+import tyro
+
 from rtcd_jax.system.errors import UserError
+
+
+def optional(metavar: str, meaning: str, otherwise: str) -> Any:
+    """An option that may be left away, and what holds then, in place of tyro's `{None}|KIND (default: None)`."""
+    return tyro.conf.arg(metavar=metavar, help=meaning, help_behavior_hint=f"(default: {otherwise})")
 
 
 def require_at_least(options: Any, **least: int) -> None:

@@ -3,23 +3,21 @@
 from dataclasses import dataclass
 from typing import Annotated
 
-import tyro
-
-from rtcd_jax.cli.checks import require_at_least
+from rtcd_jax.cli.checks import optional, require_at_least
 from rtcd_jax.system.errors import UserError
 
-_COORDINATOR = "where process 0 listens; srun and mpirun need none"
+_UNDER_SRUN = "as srun or mpirun say"
 
 
 @dataclass(frozen=True)
 class Machines:
     """The devices of this process, and the other processes of its run."""
 
-    devices: Annotated[int | None, tyro.conf.arg(help="devices to use of those each process sees [-] (all)")] = None
-    cpu_devices: Annotated[int | None, tyro.conf.arg(help="parts the CPU is split into [-] (its cores)")] = None
-    coordinator: Annotated[str | None, tyro.conf.arg(metavar="HOST:PORT", help=_COORDINATOR)] = None
-    num_processes: Annotated[int | None, tyro.conf.arg(help="processes of this run [-] (known under srun)")] = None
-    process_id: Annotated[int | None, tyro.conf.arg(help="this one's number [-] (0 …, known under srun)")] = None
+    devices: Annotated[int | None, optional("INT", "devices to use of those each process sees [-]", "all")] = None
+    cpu_devices: Annotated[int | None, optional("INT", "parts the CPU is split into [-]", "its cores")] = None
+    coordinator: Annotated[str | None, optional("HOST:PORT", "where process 0 listens", _UNDER_SRUN)] = None
+    num_processes: Annotated[int | None, optional("INT", "processes of this run [-]", _UNDER_SRUN)] = None
+    process_id: Annotated[int | None, optional("INT", "this one's number, from 0 [-]", _UNDER_SRUN)] = None
 
     def require_sense(self) -> None:
         """Raises `UserError` unless all of coordinator, number and id are given, or none, and all are in range."""

@@ -1,22 +1,19 @@
 """The console script `rtcd`: one thin function for each verb.
 
-Exit codes: 0 done; 1 the result breaks its promise; 2 the input is wrong; 75 another process of the run has ended;
-85 the system asked to stop, and the same command goes on; 130 interrupted; 141 nobody reads the output any more.
 Nothing heavy is imported before the input is known to be right.
 """
 
-import os
 import sys
 from collections.abc import Callable, Sequence
-from concurrent.futures import BrokenExecutor
 from functools import partial
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any
 
+from rtcd_jax.cli.exits import Exit, as_process, explain, say
 from rtcd_jax.system.devices import cores, prepare_jax
 from rtcd_jax.system.errors import UserError, closest
 
-OK, BROKEN_PROMISE, WRONG_INPUT, LOST_PROCESS, PREEMPTED, INTERRUPTED, CUT_OFF = 0, 1, 2, 75, 85, 130, 141
+DEBUG = "--debug"
 RUNS = Path("checkpoints")
 
 
@@ -43,7 +40,7 @@ def sweep(arguments: Sequence[str]) -> int:
     cases, options = read_sweep(arguments, RUNS)
     if options.list:
         print(show(cases, options.folder))
-        return OK
+        return Exit.OK
 
     def run(console, cluster) -> None:
         from rtcd_jax.run.optimize import optimize as run_optimize
@@ -65,10 +62,7 @@ def sweep(arguments: Sequence[str]) -> int:
 
 
 def _on_cluster(machines: Any, folder: Path, run: Callable[[Any, Any], None]) -> int:
-    """Joins the other processes of `machines`, if any, and runs `run(console, cluster)`; the exit code.
-
-    What ends early leaves the process at once.
-    """
+    """Joins the other processes of `machines`, if any, and runs `run(console, cluster)`; the exit code."""
     prepare_jax(machines.cpu_devices)
     from rtcd_jax.system.cluster import Cluster, Lost, Preempted, join, part
 
@@ -84,23 +78,11 @@ def _on_cluster(machines: Any, folder: Path, run: Callable[[Any, Any], None]) ->
         except Preempted:
             console.message(f"asked to stop (SIGTERM): saved in {folder}; the same command goes on")
             part()
-            _leave(PREEMPTED)
+            return Exit.PREEMPTED
         except Lost as error:
-            print(f"rtcd: {error}; start all of them again by the same command, to go on", file=sys.stderr)
-            _leave(LOST_PROCESS)
-        except UserError as error:
-            if cluster.processes == 1:
-                raise
-            print(f"rtcd: {error}", file=sys.stderr)
-            _leave(WRONG_INPUT)
-    return OK
-
-
-def _leave(code: int) -> NoReturn:
-    """Ends this process without waiting for what its devices still compute, or for other processes."""
-    sys.stdout.flush()
-    sys.stderr.flush()
-    os._exit(code)
+            say(f"rtcd: {error}; start all of them again by the same command, to go on")
+            return Exit.LOST_PROCESS
+    return Exit.OK
 
 
 def scale(arguments: Sequence[str]) -> int:
@@ -114,7 +96,7 @@ def scale(arguments: Sequence[str]) -> int:
     grid = options.counts("populations"), options.counts("devices")
     with Console() as console:
         study(options.config, config, *grid, options.repeats, options.folder, console)
-    return OK
+    return Exit.OK
 
 
 def verify(arguments: Sequence[str]) -> int:
@@ -129,7 +111,7 @@ def verify(arguments: Sequence[str]) -> int:
     with Console() as console:
         held = verify_run(options.run, options.states, options.seed, options.workers or cores(), console)
         _refresh(options.run, console)
-    return OK if held else BROKEN_PROMISE
+    return Exit.OK if held else Exit.REFUTED
 
 
 def report(arguments: Sequence[str]) -> int:
@@ -143,7 +125,7 @@ def report(arguments: Sequence[str]) -> int:
     with Console() as console:
         page, *figures = write_report(options.runs, options.to, console)
         console.message(f"{page}, and {len(figures)} figures in {figures[0].parent}")
-    return OK
+    return Exit.OK
 
 
 def _refresh(run: Path, console: Any) -> None:
@@ -169,7 +151,7 @@ def _finish_page(run: Path, changed: bool, console: Any) -> None:
     from rtcd_jax.analysis.report import report
 
     try:
-        page, *figures = report([run])
+        page, *figures = report([run], console=console)
     except Exception as error:
         console.message(f"the run is finished, but its report failed: {error!r}; `rtcd report {run}` makes it")
     else:
@@ -187,7 +169,7 @@ def animate(arguments: Sequence[str]) -> int:
 
     with Console() as console:
         animate_run(options.run, options.to, options.seed, console)
-    return OK
+    return Exit.OK
 
 
 def replay(arguments: Sequence[str]) -> int:
@@ -202,7 +184,7 @@ def replay(arguments: Sequence[str]) -> int:
         kept = replay_run(
             options.run, options.file, options.elite, console, options.columns, options.start, options.unwrap
         )
-    return OK if kept else BROKEN_PROMISE
+    return Exit.OK if kept else Exit.REFUTED
 
 
 def certify(arguments: Sequence[str]) -> int:
@@ -217,7 +199,7 @@ def certify(arguments: Sequence[str]) -> int:
         workers = options.workers or cores()
         whole = certify_run(options.run, options.elites, options.rung, workers, console, options.optimize_value)
         _refresh(options.run, console)
-    return OK if whole else BROKEN_PROMISE
+    return Exit.OK if whole else Exit.REFUTED
 
 
 def export(arguments: Sequence[str]) -> int:
@@ -231,7 +213,7 @@ def export(arguments: Sequence[str]) -> int:
 
     with Console() as console:
         export_run(options.run, options.elite, options.to, console, options.name)
-    return OK
+    return Exit.OK
 
 
 def disturb(arguments: Sequence[str]) -> int:
@@ -246,7 +228,7 @@ def disturb(arguments: Sequence[str]) -> int:
     with Console() as console:
         disturb_run(options.run, options.states, options.seed, console)
         _refresh(options.run, console)
-    return OK
+    return Exit.OK
 
 
 def check(arguments: Sequence[str]) -> int:
@@ -266,23 +248,23 @@ def falsify(arguments: Sequence[str]) -> int:
 
     with Console() as console:
         held = falsify_file(options.certificate, options.rollouts, options.seed, options.workers or cores(), console)
-    return OK if held else BROKEN_PROMISE
+    return Exit.OK if held else Exit.REFUTED
 
 
 def audit(arguments: Sequence[str]) -> int:
-    """show where a funnel from outside fails, and mend its nominal for a proof"""
+    """show where an external funnel fails, and project its nominal onto the dynamics for a proof"""
     from rtcd_jax.cli.proof_options import read_audit
 
     options = read_audit(arguments)
-    from rtcd_jax.certificate.audit.audit import audit as run_audit
-    from rtcd_jax.certificate.audit.external import Cost, read_outside
+    from rtcd_jax.certificate.audit.audit import audit_funnel
+    from rtcd_jax.certificate.audit.external import Cost, read_external
     from rtcd_jax.system.console import Console
 
-    given = read_outside(options.file, options.plant, options.numbers)
+    given = read_external(options.file, options.plant, options.numbers, options.funnel)
     cost = Cost.of(given, options.q, options.r, options.state_limits)
     with Console() as console:
-        held = run_audit(given, cost, options.states, options.seed, options.out, console)
-    return OK if held else BROKEN_PROMISE
+        held = audit_funnel(given, cost, options.states, options.seed, options.out, console)
+    return Exit.OK if held else Exit.REFUTED
 
 
 VERBS: dict[str, Callable[[Sequence[str]], int]] = {
@@ -303,47 +285,50 @@ VERBS: dict[str, Callable[[Sequence[str]], int]] = {
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Runs one verb and returns the exit code; `--help` and unknown options of a verb exit by themselves."""
-    verb, *rest = (sys.argv[1:] if arguments is None else arguments) or ["--help"]
+    """Runs one verb and returns the exit code.
+
+    Without `arguments` it is all that this process does, and takes the process' own: it may leave at once, heeds
+    interrupts, and ends quietly where nobody reads.
+    """
+    if arguments is None:
+        return as_process(lambda: main(sys.argv[1:]))
+    words = [word for word in arguments if word != DEBUG]
+    debug = len(words) < len(arguments)
+    try:
+        return _command(words or ["--help"], debug)
+    except SystemExit as stop:  # tyro's: help, or an option that is not there
+        return int(stop.code or 0)
+    except (Exception, KeyboardInterrupt) as error:
+        return explain(error, debug)
+
+
+def _command(words: Sequence[str], debug: bool) -> int:
+    verb, *rest = words
     if verb in ("-h", "--help"):
         print(_usage())
-        return OK
+        return Exit.OK
     if verb == "--version":
         print(_version())
-        return OK
-    try:
-        if verb not in VERBS:
-            raise UserError(f"unknown command {verb!r}; {closest(verb, tuple(VERBS))}")
-        return VERBS[verb](rest)
-    except UserError as error:
-        print(f"rtcd: {error}", file=sys.stderr)
-        return WRONG_INPUT
-    except BrokenPipeError:  # the reader, say `head`, has had enough
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return CUT_OFF
-    except OSError as error:  # no bug's: a path that may not be read, a disk that is full
-        where = f"{error.filename}: " if error.filename else ""
-        print(f"rtcd: {where}{error.strerror or error}", file=sys.stderr)
-        return WRONG_INPUT
-    except BrokenExecutor:
-        print("rtcd: a worker process was ended from outside, for want of memory perhaps: try fewer", file=sys.stderr)
-        return LOST_PROCESS
-    except KeyboardInterrupt:
-        print("stopped; run the same command to go on", file=sys.stderr)
-        return INTERRUPTED
+        return Exit.OK
+    if verb not in VERBS:
+        raise UserError(f"unknown command {verb!r}; {closest(verb, tuple(VERBS))}")
+    return VERBS[verb](rest)
 
 
 def _usage() -> str:
     width = max(map(len, VERBS))
     return "\n".join(
         [
-            "usage: rtcd COMMAND …",
+            "usage: rtcd COMMAND … [--debug]",
             "",
             "Robust co-design of underactuated robots.",
             "",
             *(f"  {name:{width}}  {verb.__doc__}" for name, verb in VERBS.items()),
             "",
             "`rtcd COMMAND --help` lists a command's options; `rtcd --version` prints the version.",
+            "",
+            "Exit codes:",
+            *(f"  {code:3d}  {code.meaning}" for code in Exit),
         ]
     )
 
@@ -352,3 +337,7 @@ def _version() -> str:
     from importlib.metadata import version
 
     return f"rtcd {version('rtcd-jax')}"
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -49,10 +49,11 @@ class FalsifyOptions:
 
 @dataclass(frozen=True)
 class AuditOptions:
-    """Simulate a funnel from outside, knot by knot, and mend its nominal motion so that one can be proved about it.
+    """Simulate an external funnel, knot by knot, and project its nominal motion onto the dynamics for a proof.
 
     FILE is a table: after a row of headings one row a knot, with the time, the states, the input held until the next
-    knot, rho, and the upper triangle of S. The gains are R^-1 B'S. Exit code 1 if a state left the funnel.
+    knot, rho, and the upper triangle of S; or the trajectory alone, and --funnel has rho and all of S. The gains are
+    R^-1 B'S. Exit code 1 if a state left the funnel.
 
     Example: rtcd audit funnel.csv --plant pendulum --parameters m=0.7 l=0.4 b=0.1 g=9.81 torque_limit=2.5
     --q 10 1 --r 0.1 --out checkpoints/audit
@@ -64,6 +65,9 @@ class AuditOptions:
     q: Annotated[tuple[float, ...], tyro.conf.arg(help="diagonal of the cost's Q [1/(s state's unit^2)]")]
     r: Annotated[float, tyro.conf.arg(help="the cost's R [1/(s input's unit^2)]")]
     out: Annotated[Path, tyro.conf.arg(metavar="FOLDER", help="where the audit and the elites are stored")]
+    funnel: Annotated[
+        Path | None, tyro.conf.arg(metavar="FILE", help="rho and S row by row, a knot a column (or a row)")
+    ] = None
     state_limits: Annotated[tuple[float, ...], tyro.conf.arg(help="largest |x_i|, inf for none [state's unit]")] = ()
     states: Annotated[int, tyro.conf.arg(help="fresh states of each ellipsoid [-] (>= 1)")] = 1000
     seed: Annotated[int, tyro.conf.arg(help="of the states [-] (>= 0)")] = 0

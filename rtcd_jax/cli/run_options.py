@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 
 import tyro
 
-from rtcd_jax.cli.checks import require_at_least, require_elite, require_run
+from rtcd_jax.cli.checks import optional, require_at_least, require_elite, require_run
 from rtcd_jax.cli.search_options import OPTIMIZE_USAGE
 from rtcd_jax.system.errors import UserError
 
@@ -38,7 +38,7 @@ class ReportOptions:
     runs: Annotated[
         tyro.conf.Positional[tuple[Path, ...]], tyro.conf.arg(metavar="RUN [RUN …]", help="the run folders")
     ]
-    to: Annotated[Path | None, tyro.conf.arg(metavar="FILE", help="the page; by default in or beside the run")] = None
+    to: Annotated[Path | None, optional("FILE", "the page", "in or beside the run")] = None
 
 
 @dataclass(frozen=True)
@@ -51,7 +51,7 @@ class AnimateOptions:
     """
 
     run: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RUN", help="the run folder")]
-    to: Annotated[Path | None, tyro.conf.arg(metavar="DIR", help="for the videos; by default animation/ in RUN")] = None
+    to: Annotated[Path | None, optional("DIR", "for the videos", "animation/ in RUN")] = None
     seed: Annotated[int, tyro.conf.arg(help="of the disturbed start, from the first ellipsoid [-] (>= 0)")] = 0
 
 
@@ -76,9 +76,7 @@ class ReplayOptions:
         tuple[str, ...],
         tyro.conf.arg(metavar="NAME=COLUMN …", help="columns of the time and the states, by name or number from 1"),
     ] = ()
-    start: Annotated[
-        float | None, tyro.conf.arg(metavar="T", help="time of the file at which the motion begins [s]; else 0")
-    ] = None
+    start: Annotated[float | None, optional("T", "time of the file at which the motion begins [s]", "0")] = None
     unwrap: Annotated[bool, tyro.conf.arg(help="take whole turns out of angles that wrap")] = False
 
 
@@ -108,7 +106,7 @@ class ExportOptions:
     ] = 0
     name: Annotated[
         str | None,
-        tyro.conf.arg(metavar="NAME", help="of the controller's files and C symbols; by default ROBOT_ELITE"),
+        optional("NAME", "of the controller's files and C symbols", "ROBOT_ELITE"),
     ] = None
 
 

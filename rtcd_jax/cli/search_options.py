@@ -8,7 +8,7 @@ from typing import Annotated
 import tyro
 from tyro.constructors import ConstructorRegistry
 
-from rtcd_jax.cli.checks import require_at_least
+from rtcd_jax.cli.checks import optional, require_at_least
 from rtcd_jax.cli.config_options import Branch, config_branch, plain
 from rtcd_jax.cli.machines import Machines
 from rtcd_jax.config.load import EXAMPLE, Config, load, parse, parse_yaml
@@ -45,8 +45,8 @@ class SweepOptions:
     """
 
     config: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="CONFIG", help="a YAML with a sweep section")]
-    folder: Annotated[Path | None, tyro.conf.arg(help="of the run folders (checkpoints/NAME)")] = None
-    case: Annotated[int | None, tyro.conf.arg(help="number of the only one to run [-] (0 …)")] = None
+    folder: Annotated[Path | None, optional("FOLDER", "of the run folders", "checkpoints/NAME")] = None
+    case: Annotated[int | None, optional("INT", "number of the only one to run [-] (>= 0)", "all of them")] = None
     list: Annotated[bool, tyro.conf.arg(help="show the cases and what is known of them, run nothing")] = False
     machines: Annotated[Machines, tyro.conf.arg(name="")] = field(default_factory=Machines)
 
@@ -64,7 +64,7 @@ class ScaleOptions:
     populations: Annotated[str, tyro.conf.arg(metavar="P,P,…", help="candidates in a generation [-]")] = "64,256,1024"
     devices: Annotated[str, tyro.conf.arg(metavar="D,D,…", help="devices to share them out over [-]")] = "1,2"
     repeats: Annotated[int, tyro.conf.arg(help="timed generations of each point [-] (>= 1)")] = 5
-    folder: Annotated[Path | None, tyro.conf.arg(help="of points, table and figures (checkpoints/scale_NAME)")] = None
+    folder: Annotated[Path | None, optional("FOLDER", "of points, table and figures", "checkpoints/scale_NAME")] = None
 
     def counts(self, name: str) -> tuple[int, ...]:
         """The numbers of a list; `UserError` for one that is no number."""

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from rtcd_jax.elite.records import INITIAL, elite_folder, elite_name, read_elite, require_elites
-from rtcd_jax.system.errors import UserError
+from rtcd_jax.system.errors import UserError, printable
 
 CLAIMED = "claimed"
 """The guarantee of a funnel that somebody else states, below *sampled*."""
@@ -71,6 +71,11 @@ class Elite:
                 f"an elite with {knots} knots, {n} states and {m} inputs cannot have {', '.join(wrong)}: must be "
                 + ", ".join(f"{name} {shape}" for name, shape in shapes.items())
             )
+        wild = [name for name in shapes if name != "state_limits" and not np.all(np.isfinite(getattr(self, name)))]
+        if wild:
+            raise UserError(f"the elite has numbers in {', '.join(wild)} that are not finite")
+        if not np.all(np.linalg.eigvalsh(self.R) > 0):
+            raise UserError("the elite's R is not positive definite")
         if not np.all(self.rho > 0):
             empty = int(np.argmin(self.rho > 0))
             raise UserError(f"the elite has no funnel: rho[{empty}] = {self.rho[empty]:g}: must be > 0")
@@ -84,6 +89,7 @@ class Elite:
         Raises:
             UserError: something is missing, or as the class.
         """
+        _require_kinds(record)
         promise = {"epsilon": 0.0, "confidence": 1.0} if record.get("rung") == CLAIMED else {}
         told = {name: record.get(name, promise.get(name)) for name in ("plant", "parameters", "epsilon", "confidence")}
         told["guarantee"] = record.get("rung")
@@ -175,3 +181,21 @@ def ellipsoid_axes(S: Float[np.ndarray, "... n n"], rho: Float[np.ndarray, "..."
 
 def _quadratic(weight: np.ndarray, error: np.ndarray) -> np.ndarray:
     return np.einsum("si,ij,sj->s", error, weight, error)
+
+
+def _require_kinds(record: Mapping[str, Any]) -> None:
+    """Raises UserError where a value of `NNN.json` is of another kind than a run writes."""
+    kinds = {"plant": str, "parameters": Mapping, "policy": Mapping, "state_limits": list, "epsilon": float | int,
+             "confidence": float | int}  # fmt: skip
+    stored = {key: value for key in kinds if (value := record.get(key)) is not None}
+    wrong = [key for key, value in stored.items() if not isinstance(value, kinds[key])]
+    for key in {"parameters", "policy"} & stored.keys() - set(wrong):
+        wrong += [f"{key}.{name}" for name, value in stored[key].items() if not isinstance(value, float | int)]
+    if not wrong and not all(
+        limit is None or isinstance(limit, float | int) for limit in stored.get("state_limits", ())
+    ):
+        wrong.append("state_limits")
+    if wrong:
+        raise UserError(
+            f"the elite's {', '.join(map(printable, wrong))} cannot be read: of another kind than a run writes"
+        )

@@ -11,7 +11,7 @@ import os
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import jax
 import numpy as np
@@ -20,6 +20,7 @@ import yaml
 from rtcd_jax.elite.records import elite_name
 from rtcd_jax.export import robot, source, tables
 from rtcd_jax.export.bundle import Bundle, certificate_path, read_bundle
+from rtcd_jax.system.console import Console
 from rtcd_jax.system.errors import UserError
 from rtcd_jax.system.files import is_temporary, plain, replace, replace_json, writing
 
@@ -27,10 +28,6 @@ FORMAT = "rtcd_jax export"
 VERSION = 1
 MARK = "export.json"
 """Says that a folder is an export, and the digest of every file that belongs to it."""
-
-
-class Console(Protocol):
-    def message(self, text: str, /) -> None: ...
 
 
 def export_run(folder: Path, elite: int | str, target: Path, console: Console, label: str | None = None) -> None:

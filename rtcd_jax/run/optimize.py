@@ -1,7 +1,6 @@
 """A whole run: config -> search -> elites evaluated again -> run folder. Stops and resumes at any generation."""
 
 import math
-import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
@@ -21,7 +20,7 @@ from rtcd_jax.run.sharding import Spread, spread
 from rtcd_jax.search import search
 from rtcd_jax.search.archive import Elites
 from rtcd_jax.system.cluster import Cluster, Preempted
-from rtcd_jax.system.console import Console, Progress
+from rtcd_jax.system.console import Clock, Console, Progress, times
 from rtcd_jax.system.errors import UserError
 from rtcd_jax.types import Evaluation, Status
 
@@ -58,12 +57,12 @@ def optimize(config: Config, folder: Path, console: Console, cluster: Cluster) -
             f"compiling the evaluation of {config.search.population} candidates on {cluster}: a minute or so"
         )
         again = _Again(problem, cluster, example)
-        state, clock = begun, _Clock(config.search.population)
+        state, pace = begun, _Pace(config)
         try:
             for state, generation in search.run(plan, evaluate, begun):
                 run.append(vars(generation))
                 run.save_if_due(state, int(state.generation))
-                console.progress(_progress(config, generation, clock))
+                console.progress(pace.progress(generation))
                 cluster.look(int(state.generation))
         except Preempted:
             run.save(state, int(state.generation))
@@ -76,36 +75,34 @@ def optimize(config: Config, folder: Path, console: Console, cluster: Cluster) -
         return True
 
 
-class _Clock:
-    """Wall time of this process' generations; the first one compiles and says little about the others."""
+class _Pace:
+    """How fast this process' generations are; the first one compiles and says little about the others."""
 
-    def __init__(self, population: int):
-        self.population = population
-        self.begun = time.monotonic()
-        self.ends: list[float] = []
+    def __init__(self, config: Config):
+        self._population, self._generations = config.search.population, config.search.generations
+        self._clock = Clock()
+        self._ends: list[float] = []
 
-    def tick(self) -> tuple[float, float]:
-        """At a generation's end: seconds since the start; candidates per second, NaN for the first one."""
-        self.ends.append(time.monotonic())
-        later = len(self.ends) - 1
-        rate = later * self.population / (self.ends[-1] - self.ends[0]) if later else math.nan
-        return self.ends[-1] - self.begun, rate
+    def progress(self, generation: search.Generation) -> Progress:
+        """What is known at a generation's end; volumes are of the `sampled` rung, NaN where there is none."""
+        self._ends.append(self._clock.elapsed)
+        done, later = generation.index + 1, len(self._ends) - 1
+        seconds = (self._ends[-1] - self._ends[0]) / later if later else math.nan
+        parts = [
+            f"generation {done:{len(str(self._generations))}d}/{self._generations}",
+            f"best {_volume(generation.best_so_far)} (sampled)",
+            f"median {_volume(generation.median)}",
+            f"feasible {generation.feasible:4.0%}",
+            f"{self._population / seconds:.3g} candidates/s" if later else "compiled",
+            times(self._ends[-1], (self._generations - done) * seconds),
+        ]
+        failures = [f"{count} {name.lower()}" for name, count in generation.counts.items() if name != Status.OK.name]
+        text = "  ".join([*parts, f"failed: {', '.join(failures)}"] if failures else parts)
+        return Progress(done, self._generations, text)
 
 
-def _progress(config: Config, generation: search.Generation, clock: _Clock) -> Progress:
-    elapsed, rate = clock.tick()
-    left = config.search.generations - generation.index - 1
-    return Progress(
-        generation=generation.index + 1,
-        generations=config.search.generations,
-        best=generation.best_so_far,
-        median=generation.median,
-        feasible=generation.feasible,
-        rate=rate,
-        elapsed=elapsed,
-        left=left * config.search.population / rate,
-        failures={name: count for name, count in generation.counts.items() if name != Status.OK.name},
-    )
+def _volume(value: float) -> str:
+    return "none" if math.isnan(value) else f"{value:.5g}"
 
 
 class _Again:

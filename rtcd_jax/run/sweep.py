@@ -22,11 +22,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, final
 
-from rich.box import SIMPLE
-from rich.console import Console as Terminal
-from rich.table import Table
-
 from rtcd_jax.config.load import Config, parse, read_yaml
+from rtcd_jax.system.console import table
 from rtcd_jax.system.errors import ConfigError, Problem, UserError, closest
 from rtcd_jax.system.files import make_folder, read_json, reading, replace
 
@@ -139,17 +136,16 @@ def show(cases: Sequence[Case], folder: Path) -> str:
     writer.writerows(rows)
     make_folder(folder)
     replace(folder / TABLE, text.getvalue().encode())
-    table = Table(box=SIMPLE, title="volumes are of the sampled rung")
-    for heading in ("case", *cases[0].values, "generations", "initial", "best", "ratio"):
-        table.add_column(heading, justify="right")
-    for case, row in zip(cases, rows, strict=True):
-        objective = case.config.search.objective
-        numbers = (row[f"initial_{objective}"], row[f"best_{objective}"], row["ratio"])
-        shown = ("" if number is None else f"{number:.5g}" for number in numbers)
-        table.add_row(str(case.number), *map(str, case.values.values()), row["generations"], *shown)
-    printed = io.StringIO()
-    Terminal(file=printed, width=132).print(table)
-    return f"{printed.getvalue().rstrip()}\n{folder / TABLE}"
+    headings = ("case", *cases[0].values, "generations", "initial", "best", "ratio")
+    cells = [_cells(case, row) for case, row in zip(cases, rows, strict=True)]
+    return f"{table(headings, cells, 'volumes are of the sampled rung')}\n{folder / TABLE}"
+
+
+def _cells(case: Case, row: Mapping[str, Any]) -> list[str]:
+    objective = case.config.search.objective
+    numbers = (row[f"initial_{objective}"], row[f"best_{objective}"], row["ratio"])
+    shown = ("" if number is None else f"{number:.5g}" for number in numbers)
+    return [str(case.number), *map(str, case.values.values()), row["generations"], *shown]
 
 
 def _row(case: Case) -> dict[str, Any]:

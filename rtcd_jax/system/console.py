@@ -1,70 +1,68 @@
-"""Progress of long work: a live line on a terminal, plain lines elsewhere. Takes plain numbers."""
+"""What a verb says: messages that stay, the progress of long work as a live line on a terminal, and tables."""
 
+import io
 import math
 import sys
-from collections.abc import Mapping
-from dataclasses import dataclass, field
-from typing import Protocol, Self, TextIO
+import time
+from collections.abc import Container, Iterable, Sequence
+from dataclasses import dataclass
+from typing import Self, TextIO, final
 
+from rich.box import SIMPLE
 from rich.console import Console as Terminal
 from rich.progress import BarColumn, TextColumn
 from rich.progress import Progress as Bar
+from rich.table import Table
+
+WIDTH = 150
+"""Characters of a table's row at most; longer cells are wrapped."""
 
 
-class Countable(Protocol):
-    """How far some work is: `done` of `total` parts, and `str` says the rest."""
-
-    @property
-    def done(self) -> int: ...
-
-    @property
-    def total(self) -> int: ...
-
-
+@final
 @dataclass(frozen=True)
 class Progress:
-    """One generation. Volumes are of the `sampled` rung, in the product of the states' units.
+    """`done` of `total` parts of some work, in any unit, and the line that says so."""
 
-    `best` is the best so far, `median` this generation's among the feasible; NaN where there is none.
-    `feasible` is a share in [0, 1], `rate` in candidates a second, `elapsed` and `left` in seconds; `rate` and `left`
-    are NaN for a generation that compiled.
-    `failures` counts this generation's candidates without a funnel by the name of their status.
-    """
+    done: float
+    total: float
+    text: str
 
-    generation: int
-    generations: int
-    best: float
-    median: float
-    feasible: float
-    rate: float
-    elapsed: float
-    left: float
-    failures: Mapping[str, int] = field(default_factory=dict)
+
+@final
+class Clock:
+    """Wall time of some work that begins now, of which `before` parts were done by an earlier call."""
+
+    def __init__(self, before: float = 0):
+        self._begun, self._before = time.monotonic(), before
 
     @property
-    def done(self) -> int:
-        return self.generation
+    def elapsed(self) -> float:
+        """Seconds since the beginning."""
+        return time.monotonic() - self._begun
 
-    @property
-    def total(self) -> int:
-        return self.generations
-
-    def __str__(self) -> str:
-        parts = [
-            f"generation {self.generation:{len(str(self.generations))}d}/{self.generations}",
-            f"best {_volume(self.best)} (sampled)",
-            f"median {_volume(self.median)}",
-            f"feasible {self.feasible:4.0%}",
-            "compiled" if math.isnan(self.rate) else f"{self.rate:.3g} candidates/s",
-            f"elapsed {_duration(self.elapsed)}",
-            f"left {_duration(self.left)}",
-        ]
-        failed = ", ".join(f"{count} {name.lower()}" for name, count in self.failures.items() if count)
-        return "  ".join([*parts, f"failed: {failed}"] if failed else parts)
+    def times(self, done: float, total: float) -> str:
+        """Elapsed time, and what is left if all parts take as long as those since the beginning."""
+        elapsed, fresh = self.elapsed, done - self._before
+        return times(elapsed, elapsed * (total - done) / fresh if fresh > 0 else math.nan)
 
 
+def times(elapsed: float, left: float) -> str:
+    """Both [s] as every line of progress shows them; `left` is NaN where it is not known."""
+    return f"elapsed {duration(elapsed)}  left {duration(left)}"
+
+
+def duration(seconds: float) -> str:
+    """Hours, minutes and seconds, as 1:02:05 or 0:12."""
+    if not math.isfinite(seconds):
+        return "unknown"
+    minutes, rest = divmod(round(seconds), 60)
+    hours, minutes = divmod(minutes, 60)
+    return f"{hours}:{minutes:02d}:{rest:02d}" if hours else f"{minutes}:{rest:02d}"
+
+
+@final
 class Console:
-    """Where a run speaks: stdout, a stream or a rich terminal. A context manager: leaving it ends the live line."""
+    """Where a verb speaks: stdout, a stream or a rich terminal. A context manager: leaving it ends the live line."""
 
     def __init__(self, stream: TextIO | None = None, terminal: Terminal | None = None):
         self._terminal = terminal or Terminal(file=stream or sys.stdout)
@@ -83,17 +81,18 @@ class Console:
         self._terminal.print(text, soft_wrap=True, highlight=False, markup=False, emoji=False)
         self._terminal.file.flush()
 
-    def progress(self, now: Countable) -> None:
+    def progress(self, now: Progress) -> None:
         """Redraws the live line on a terminal; prints a line elsewhere."""
         if not self._terminal.is_terminal:
-            self.message(str(now))
+            self.message(now.text)
             return
         if self._bar is None:
             columns = BarColumn(bar_width=16), TextColumn("{task.description}", markup=False)
             self._bar = Bar(*columns, console=self._terminal, auto_refresh=False)
-            self._bar.add_task("", total=now.total)
+            self._bar.add_task("")
             self._bar.start()
-        self._bar.update(self._bar.task_ids[0], completed=now.done, description=str(now), refresh=True)
+        task = self._bar.task_ids[0]
+        self._bar.update(task, completed=now.done, total=now.total, description=now.text, refresh=True)
 
 
 def silent() -> Console:
@@ -101,13 +100,16 @@ def silent() -> Console:
     return Console(terminal=Terminal(quiet=True))
 
 
-def _volume(value: float) -> str:
-    return "none" if math.isnan(value) else f"{value:.5g}"
-
-
-def _duration(seconds: float) -> str:
-    if not math.isfinite(seconds):
-        return "unknown"
-    minutes, rest = divmod(round(seconds), 60)
-    hours, minutes = divmod(minutes, 60)
-    return f"{hours}:{minutes:02d}:{rest:02d}" if hours else f"{minutes}:{rest:02d}"
+def table(
+    headings: Sequence[str], rows: Iterable[Sequence[str]], title: str | None = None, left: Container[str] = ()
+) -> str:
+    """A table as text; columns are aligned to the right but for those in `left`. A short row leaves cells empty."""
+    drawn = Table(box=SIMPLE, title=title)
+    for heading in headings:
+        drawn.add_column(heading, justify="left" if heading in left else "right")
+    for row in rows:
+        drawn.add_row(*row)
+    text = io.StringIO()
+    plain = Terminal(file=text, width=WIDTH, force_terminal=False, color_system=None, markup=False, emoji=False)
+    plain.print(drawn)
+    return text.getvalue().rstrip()

@@ -2,7 +2,7 @@
 
 import difflib
 from collections.abc import Iterable, Sequence
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Self
 
 NO_VALUE = object()
 """Stands for a value where there is none to show."""
@@ -45,6 +45,10 @@ class ConfigError(UserError):
         if not others:
             told = [f"{source}: {first if first.path or first.value is not NO_VALUE else first.text}"]
         super().__init__("\n".join(told))
+
+    def __reduce__(self) -> tuple[type[Self], tuple[tuple[Problem, ...], str]]:
+        """What a worker process hands back is made again from its parts."""
+        return type(self), (self.problems, self.source)
 
 
 def closest(word: object, known: Sequence[str]) -> str:

@@ -82,7 +82,7 @@ def reading(path: Path, advice: str) -> Iterator[None]:
         yield
     except UserError:
         raise
-    except (OSError, EOFError, KeyError, TypeError, ValueError, zipfile.BadZipFile) as error:
+    except (OSError, EOFError, KeyError, TypeError, ValueError, RecursionError, zipfile.BadZipFile) as error:
         lacks = "it lacks " if isinstance(error, KeyError) else ""
         told = getattr(error, "strerror", None) or lacks + " ".join(str(error).split()) or type(error).__name__
         raise UserError(f"cannot read {path}: {told}; {advice}") from error

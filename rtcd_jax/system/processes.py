@@ -1,20 +1,45 @@
-"""Processes that share out a task, and end with the process that began them, however that ends."""
+"""Processes that share out a task, and end with the process that began them, however that ends.
+
+Ctrl-C reaches the whole terminal: they leave it to the process that began them.
+"""
 
 import multiprocessing
 import os
+import signal
 from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
 from multiprocessing.connection import wait
+from multiprocessing.context import SpawnContext, SpawnProcess
 from threading import Thread
 from typing import Any
 
-CONTEXT = multiprocessing.get_context("spawn")
+
+class _Worker(SpawnProcess):
+    def start(self) -> None:
+        """With SIGINT blocked from its first instruction on: what is blocked is inherited."""
+        before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+        try:
+            super().start()
+        finally:
+            signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+class _Context(SpawnContext):
+    Process = _Worker
+
+
+CONTEXT = _Context()
+_TIDY = "ignore:resource_tracker:UserWarning"
 
 
 @contextmanager
 def processes(count: int, prepare: Callable[..., None] | None = None, *told: Any) -> Iterator[ProcessPoolExecutor]:
     """`count` processes, each of which first calls `prepare` with what it is told; what still waits is dropped."""
+    # multiprocessing's own tidying process would count on stderr what a process that leaves at once has left to it.
+    warnings = os.environ.get("PYTHONWARNINGS", "")
+    if _TIDY not in warnings:
+        os.environ["PYTHONWARNINGS"] = f"{warnings},{_TIDY}".lstrip(",")
     with ProcessPoolExecutor(count, CONTEXT, _begin, (prepare, *told)) as pool:
         try:
             yield pool
@@ -33,3 +58,9 @@ def _end_with_parent() -> None:
     if parent is not None:
         wait([parent.sentinel])
         os._exit(1)
+
+
+def end_workers() -> None:
+    """Ends those that this process has begun; for a process that ends at once and waits for none."""
+    for worker in multiprocessing.active_children():
+        worker.kill()

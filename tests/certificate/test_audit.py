@@ -1,18 +1,26 @@
-"""Funnels from outside: read as documented, judged by simulation, their nominal mended into a solution."""
+"""External funnels: read as documented, judged by simulation, their nominal projected onto the dynamics."""
 
 import json
 import math
 import os
+import random
+import re
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from rtcd_jax.analysis.disturb.comparison import read_contest
 from rtcd_jax.certificate import check
-from rtcd_jax.certificate.audit.external import Cost, elite_of, read_outside
-from rtcd_jax.certificate.audit.repair import defects, repaired
+from rtcd_jax.certificate.audit.external import Cost, elite_of, read_external
+from rtcd_jax.certificate.audit.projection import defects, projected, with_fitting_inputs
 from rtcd_jax.cli import main as cli
 from rtcd_jax.elite.records import read_elite
+from rtcd_jax.system.console import silent
+from rtcd_jax.system.errors import UserError
+from tests.analysis.replay.test_measured import mutated
 from tests.certificate import swing
 
 HEADINGS = "time_s,theta_rad,theta_dot_rad_s,torque_Nm,rho,S11,S12,S22"
@@ -37,17 +45,17 @@ def table(path, rho=4.0, off=0.0):
 
 
 def read(path):
-    return read_outside(path, "pendulum", swing.PARAMETERS)
+    return read_external(path, "pendulum", swing.PARAMETERS)
 
 
-def cost(outside):
-    return Cost.of(outside, (4.0, 8.0), 10.0, (7.0, 7.0))
+def cost(external):
+    return Cost.of(external, (4.0, 8.0), 10.0, (7.0, 7.0))
 
 
 def test_a_table_is_read_bit_by_bit(tmp_path):
     arrays, _ = swing.elite()
-    outside = read(table(tmp_path / "x.csv"))
-    stored, record = elite_of(outside, cost(outside))
+    external = read(table(tmp_path / "x.csv"))
+    stored, record = elite_of(external, cost(external))
     for name in ("x", "u", "x_goal", "u_max", "Q", "R"):
         np.testing.assert_array_equal(stored[name], arrays[name])
     np.testing.assert_array_equal(np.triu(stored["S"]), np.triu(arrays["S"]))
@@ -58,26 +66,26 @@ def test_a_table_is_read_bit_by_bit(tmp_path):
 
 
 def test_a_motion_that_solves_the_dynamics_is_left_as_it_is(tmp_path):
-    outside = read(table(tmp_path / "x.csv"))
-    assert np.abs(defects(outside)).max() < 1e-9
-    mended = repaired(outside, cost(outside))
-    np.testing.assert_allclose(mended.x, outside.x, atol=1e-8)
-    np.testing.assert_allclose(mended.u, outside.u, atol=1e-6)
-    np.testing.assert_allclose(mended.S, outside.S, rtol=1e-6)
-    np.testing.assert_allclose(mended.volumes, outside.volumes)
+    external = read(table(tmp_path / "x.csv"))
+    assert np.abs(defects(external)).max() < 1e-9
+    moved = projected(external, cost(external))
+    np.testing.assert_allclose(moved.x, external.x, atol=1e-8)
+    np.testing.assert_allclose(moved.u, external.u, atol=1e-6)
+    np.testing.assert_allclose(moved.S, external.S, rtol=1e-6)
+    np.testing.assert_allclose(moved.volumes, external.volumes)
 
 
-def test_a_bent_motion_is_mended_with_its_ends_and_within_the_limits(tmp_path):
-    outside = read(table(tmp_path / "x.csv", off=0.02))
-    assert np.abs(defects(outside)).max() > 0.01
-    mended = repaired(outside, cost(outside))
-    assert np.abs(defects(mended)).max() < 1e-10
-    np.testing.assert_array_equal(mended.x[[0, -1]], outside.x[[0, -1]])
-    assert np.abs(mended.u).max() <= 2.5
-    assert 0 < np.abs(mended.x - outside.x).max() < 0.1
+def test_a_bent_motion_is_moved_with_its_ends_and_within_the_limits(tmp_path):
+    external = read(table(tmp_path / "x.csv", off=0.02))
+    assert np.abs(defects(external)).max() > 0.01
+    moved = projected(external, cost(external))
+    assert np.abs(defects(moved)).max() < 1e-10
+    np.testing.assert_array_equal(moved.x[[0, -1]], external.x[[0, -1]])
+    assert np.abs(moved.u).max() <= 2.5
+    assert 0 < np.abs(moved.x - external.x).max() < 0.1
     straight = read(table(tmp_path / "y.csv"))
-    far = np.sum((mended.x - outside.x) ** 2) + np.sum((mended.u - outside.u) ** 2) / 2.5**2
-    assert far < np.sum((straight.x - outside.x) ** 2) * 1.5  # the motion that was bent is one candidate
+    far = np.sum((moved.x - external.x) ** 2) + np.sum((moved.u - external.u) ** 2) / 2.5**2
+    assert far < np.sum((straight.x - external.x) ** 2) * 1.5  # the motion that was bent is one candidate
 
 
 def test_an_honest_funnel_lets_nothing_out_and_is_proved(tmp_path, capsys):
@@ -117,7 +125,7 @@ def without(word):
     ("text", "arguments", "reason"),
     [
         ("a\n1,2\n", ARGUMENTS, "must have at least 2 rows of 8 finite numbers: time, theta, theta_dot, input, rho"),
-        ("a\n1,x\n", ARGUMENTS, "must be a row of headings and rows of 8 numbers"),
+        ("a\n1,x\n", ARGUMENTS, "line 2, cell 2 = 'x': must be a finite number"),
         (None, without("b="), "must be those of the pendulum, m, l, b, g, torque_limit; differ in b"),
         (None, [*ARGUMENTS, "--parameters", "m=heavy"], "--parameters m=heavy: must be NAME=VALUE with a number"),
         (None, [*ARGUMENTS, "--plant", "pendulumm"], "--plant = 'pendulumm': unknown plant; did you mean 'pendulum'?"),
@@ -150,13 +158,190 @@ def test_wrong_tables_are_refused(tmp_path, capsys, old, new, reason):
     assert reason in capsys.readouterr().err
 
 
+def pair(tmp_path, moved=False, across=True):
+    """The small motion's two files, as the labs' tools write them: inputs moved by a knot, a knot a column."""
+    arrays, _ = swing.elite()
+    torques = arrays["u"][:, 0]
+    inputs = np.append(0.0, torques) if moved else np.append(torques, 0.0)
+    rows = np.column_stack([arrays["time"], arrays["x"], inputs])
+    trajectory, funnel = tmp_path / "trajectory.csv", tmp_path / "funnel.csv"
+    np.savetxt(trajectory, rows, delimiter=",", header="time,pos,vel,torque", comments="")
+    numbers = np.column_stack([np.full(5, 4.0), arrays["S"].reshape(5, -1)])
+    np.savetxt(funnel, numbers.T if across else numbers, delimiter=",", header="rho,S_t", comments="")
+    return trajectory, funnel
+
+
+@pytest.mark.parametrize("moved", [False, True])
+def test_inputs_are_taken_as_they_fit_the_dynamics(tmp_path, moved):
+    trajectory, funnel = pair(tmp_path, moved)
+    given, misfits = with_fitting_inputs(read_external(trajectory, "pendulum", swing.PARAMETERS, funnel))
+    np.testing.assert_array_equal(given.u, swing.elite()[0]["u"][:, 0])
+    names = ["as written", "moved by one knot"]
+    fits, other = names[::-1] if moved else names
+    assert misfits[fits] < 1e-8
+    assert misfits[other] > 1e-3
+    np.testing.assert_allclose(given.S, swing.elite()[0]["S"], rtol=1e-12)
+
+
+def test_a_pair_of_files_is_audited_as_one_table_is(tmp_path, capsys):
+    results = []
+    for name, files in (("one", [table(tmp_path / "x.csv")]), ("two", pair(tmp_path, moved=True, across=False))):
+        more = ["--funnel", str(files[1])] if len(files) == 2 else []
+        out = tmp_path / name
+        command = ["audit", str(files[0]), *more, *ARGUMENTS, "--states", "20", "--out", str(out)]
+        assert cli.main(command) == 0
+        results.append(json.loads((out / "audit.json").read_text())["knots"])
+    for name, numbers in results[0].items():
+        np.testing.assert_allclose(results[1][name], numbers, rtol=1e-9)
+    said = capsys.readouterr().out
+    assert "inputs taken moved by one knot" in said
+    assert "0.0% miss the goal's ellipsoid at the last knot, 0.0% leave the limits" in said
+
+
+def test_a_rail_that_is_left_is_told(tmp_path):
+    """The motion's own velocities lie on both sides of the limit."""
+    fastest = np.abs(swing.elite()[0]["x"][:, 1]).max()
+    limits = ["--state_limits", "inf", str(1.001 * fastest)]
+    out = tmp_path / "out"
+    cli.main(["audit", str(table(tmp_path / "x.csv")), *ARGUMENTS, *limits, "--states", "50", "--out", str(out)])
+    shares = json.loads((out / "audit.json").read_text())["knots"]["limit_share"]
+    assert 0 < shares[0] < 1
+
+
+@pytest.mark.parametrize(
+    ("change", "reason"),
+    [
+        (lambda rows: rows[:, :-1], "has 5 rows of 4 numbers: must have 5 rows"),
+        (lambda rows: rows * [[1], [1], [1.1], [1], [1]], "an S is not symmetric"),
+        (lambda rows: rows * [[-1], [1], [1], [1], [1]], "rho of knot 0 must be positive"),
+    ],
+)
+def test_wrong_funnel_files_are_refused(tmp_path, change, reason):
+    trajectory, funnel = pair(tmp_path)
+    np.savetxt(funnel, change(np.loadtxt(funnel, delimiter=",", skiprows=1)), delimiter=",")
+    if "rows of 4" in reason:
+        reason = "has 5 rows of 4 numbers"
+    with pytest.raises(UserError, match=reason):
+        read_external(trajectory, "pendulum", swing.PARAMETERS, funnel)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "reason"),
+    [
+        (["m=0"], "--parameters m=0.0: must be a number from 1e-12"),
+        (["m=nan"], "--parameters m=nan: must be"),
+        (["b=-1"], "--parameters b=-1.0: must be a number from 0"),
+        (["torque_limit=inf"], "--parameters torque_limit=inf: must be"),
+        (["m=1e300"], "--parameters m=1e+300: must be"),
+        ([*["b=0", "--r", "nan"]], "--r = nan"),
+        ([*["b=0", "--r", "inf"]], "--r = inf"),
+        ([*["b=0", "--q", "inf", "1"]], "--q = inf 1.0: must be 2 numbers"),
+        ([*["b=0", "--state_limits", "nan", "1"]], "--state_limits = nan 1.0: must be 2 numbers"),
+    ],
+)
+def test_numbers_that_no_robot_has_are_refused(tmp_path, capsys, arguments, reason):
+    name, _, _ = arguments[0].partition("=")
+    own = [f"{key}={value}" for key, value in swing.PARAMETERS.items() if key != name]
+    given = ["--plant", "pendulum", "--q", "4", "8", "--r", "10", "--parameters", *own, *arguments]
+    assert cli.main(["audit", str(table(tmp_path / "x.csv")), *given, "--out", str(tmp_path / "out")]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert reason in line
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("text", "reason"),
+    [
+        (
+            "h\n-1e308,3.14159265,0,0,1,1,0,1\n1e308,3.14159265,0,0,1,1,0,1\n",
+            "cell 1 = '-1e308': must be a finite number",
+        ),
+        ("h\n0,1e308,0,0,1,1,0,1\n", "cell 2 = '1e308'"),
+        ("h\n0,0,0,0,1,1,0," + "1" * 200_000 + "\n", "field larger than field limit"),
+        ("h\n0,3.14159265,0,0,1,1,0,1\n1,2\n", "line 3 has 2 cells, the first row 8"),
+        ("h\n0,0,0,0,1,5e-324,0,5e-324\n1,3.14159265,0,0,1,1,0,1\n", "the volume of knot 0 is beyond all numbers"),
+        ("", "is empty: must be a table of the columns time, theta, theta_dot, input, rho, upper triangle of S"),
+        ("h\n\x00\n", "is no text"),
+    ],
+)
+def test_tables_of_impossible_numbers_are_one_line(tmp_path, text, reason):
+    path = tmp_path / "x.csv"
+    path.write_text(text)
+    with pytest.raises(UserError, match=re.escape(reason)) as error:
+        read(path)
+    assert str(error.value).isprintable()
+
+
+def test_a_thousand_mutated_tables_are_funnels_or_one_line(tmp_path):
+    rng, whole = random.Random(2), table(tmp_path / "whole.csv").read_bytes()
+    trajectory, funnel = pair(tmp_path)
+    files = [(tmp_path / "x.csv", whole, ()), (funnel, funnel.read_bytes(), (trajectory, funnel))]
+    messages = []
+    for number in range(1000):
+        path, content, files_of_pair = files[number % 2]
+        path.write_bytes(mutated(content, rng))
+        first, *second = files_of_pair or (path,)
+        try:
+            external = read_external(first, "pendulum", swing.PARAMETERS, *second)
+            external, _ = with_fitting_inputs(external)
+        except UserError as error:
+            messages.append(str(error))
+        else:
+            assert np.isfinite(external.volumes).all()
+            assert (external.volumes > 0).all()
+            assert np.isfinite(external.u).all()
+    assert 100 < len(messages) < 950
+    assert [message for message in messages if not message.isprintable()] == []
+
+
+@pytest.fixture(scope="module")
+def audited(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("audited")
+    out = folder / "out"
+    assert cli.main(["audit", str(table(folder / "x.csv")), *ARGUMENTS, "--states", "5", "--out", str(out)]) == 0
+    arrays, _ = swing.elite()
+    rows = np.column_stack([arrays["time"], arrays["x"]]).tolist()
+    (folder / "lab.csv").write_text("\n".join(["time,pos,vel", *(",".join(map(str, row)) for row in rows)]))
+    return out
+
+
+@pytest.mark.parametrize(
+    ("verb", "arguments", "made"),
+    [
+        ("replay", ["{run}/../lab.csv"], "replay/lab_000.json"),
+        ("replay", ["{run}/../lab.csv", "--elite", "initial"], "replay/lab_initial.json"),
+        ("report", [], "report.html"),
+        ("verify", ["--states", "5", "--workers", "1"], "verification/initial.json"),
+        ("export", ["--to", "{run}/lab"], "lab/export.json"),
+    ],
+)
+def test_every_verb_reads_the_audited_folder(audited, verb, arguments, made, monkeypatch):
+    monkeypatch.setattr(cli, "prepare_jax", lambda *_: None)
+    given = [argument.replace("{run}", str(audited)) for argument in arguments]
+    assert cli.main([verb, str(audited), *given]) == 0
+    assert (audited / made).exists()
+
+
+def test_animate_reads_the_audited_folder(audited):
+    """In a process of its own, which owns the graphics."""
+    done = subprocess.run([sys.executable, "-m", "rtcd_jax", "animate", str(audited)], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert (audited / "animation" / "swingup.gif").is_file()
+
+
+def test_disturb_reads_the_audited_folder(audited):
+    contest = read_contest(audited, silent())
+    assert contest.names == ("initial", "best")
+    assert {elite.guarantee for elite in contest.elites} == {"claimed"}
+
+
 @pytest.mark.skipif(not REFERENCE.is_file(), reason="RTCD_REFERENCE names no folder with pendulum_initial.csv")
 def test_the_published_funnel_of_the_initial_pendulum(tmp_path):
-    """The exact areas are the published ones, most of the first ellipse leaves, and a mended nominal is near."""
-    outside = read_outside(REFERENCE, "pendulum", {"m": 0.7, "l": 0.4, "b": 0.1, "g": 9.81, "torque_limit": 2.5})
-    assert outside.volumes.sum() == pytest.approx(156.9, abs=0.05)
-    mended = repaired(outside, Cost.of(outside, (10.0, 1.0), 0.1, ()))
-    assert np.abs(mended.x - outside.x).max() < 0.2
+    """The exact areas are the published ones, most of the first ellipse leaves, and a moved nominal is near."""
+    external = read_external(REFERENCE, "pendulum", {"m": 0.7, "l": 0.4, "b": 0.1, "g": 9.81, "torque_limit": 2.5})
+    assert external.volumes.sum() == pytest.approx(156.9, abs=0.05)
+    moved = projected(external, Cost.of(external, (10.0, 1.0), 0.1, ()))
+    assert np.abs(moved.x - external.x).max() < 0.2
     arguments = [
         "--parameters",
         "m=0.7",

@@ -15,17 +15,7 @@ from rtcd_jax.elite.elite import Elite
 from rtcd_jax.system.errors import UserError
 from tests.certificate import swing
 from tests.certificate.folder import folder_with
-
-
-class Console:
-    def __init__(self):
-        self.lines, self.steps = [], []
-
-    def message(self, text):
-        self.lines.append(text)
-
-    def progress(self, now):
-        self.steps.append(now)
+from tests.consoles import Screen
 
 
 def folder_of(path, **changed):
@@ -96,24 +86,24 @@ def test_a_funnel_that_ends_before_the_start_is_told(tmp_path):
     u = arrays["u"].copy()
     u[0] -= 40.0
     run = folder_of(tmp_path, u=u)
-    console = Console()
-    assert not certify_run(run, 1, "proved", 1, console)
+    screen = Screen()
+    assert not certify_run(run, 1, "proved", 1, screen.console)
     report = check.check_file(run / "certificates" / "000.json")
     assert 0 < report.start <= swing.DT
-    assert "0.05" in console.lines[0]
+    assert any(line.split()[:2] == ["000", "0.05"] for line in screen.text.splitlines())
 
 
 @pytest.mark.parametrize("rung", elite.RUNGS)
 def test_a_run_is_certified_in_processes_of_its_own(tmp_path, rung):
-    run, console = folder_of(tmp_path), Console()
-    assert certify_run(run, 1, rung, 2, console)
+    run, screen = folder_of(tmp_path), Screen()
+    assert certify_run(run, 1, rung, 2, screen.console)
     summary = json.loads((run / "certificates" / "summary.json").read_text())["000"]
     report = check.check_file(run / "certificates" / "000.json")
     assert summary["rung"] == rung
     assert summary["found"] == report.volumes
-    assert f"sampled / {rung}" in console.lines[0]
-    assert console.steps[-1].done == console.steps[-1].total
-    assert "back to t = 0.000 s" in str(console.steps[-1])
+    assert f"volumes: sampled / {rung}" in screen.text
+    assert "elite 000  interval 1/" in screen.text, "drawn on the terminal"
+    assert "back to t = 0.000 s" in screen.text
     assert not list((run / "certificates").glob(".*"))
 
 

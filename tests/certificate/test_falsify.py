@@ -14,6 +14,7 @@ from rtcd_jax.cli import main as cli
 from tests.certificate import swing
 from tests.certificate.loops import floats
 from tests.certificate.test_check import nudged, resealed
+from tests.consoles import Screen, Stopped
 
 
 def random():
@@ -93,36 +94,21 @@ def test_the_command_line(run, tmp_path, capsys):
     assert "was changed: its digest is another" in capsys.readouterr().err
 
 
-class Killed(Exception):
-    pass
-
-
-class Stopped:
-    """A console that is killed after so many reports of progress."""
-
-    def __init__(self, after=None):
-        self.after, self.done, self.lines = after, [], []
-
-    def message(self, text):
-        self.lines.append(text)
-
-    def progress(self, now):
-        self.done.append(now.done)
-        if len(self.done) == self.after:
-            raise Killed
-
-
 def test_a_killed_falsification_goes_on(run, tmp_path, monkeypatch):
     monkeypatch.setattr(falsify, "CHUNK", 64)
     file = tmp_path / "000.json"
     file.write_bytes((run / "certificates" / "000.json").read_bytes())
-    whole, killed, resumed = Stopped(), Stopped(after=2), Stopped()
-    assert falsify_file(file, 200, 0, 1, whole)
-    with pytest.raises(Killed):
-        falsify_file(file, 200, 0, 1, killed)
-    assert falsify_file(file, 200, 0, 1, resumed)
-    assert (whole.done, resumed.done) == ([64, 128, 192, 200], [192, 200])
-    assert resumed.lines == whole.lines
+    whole, killed, resumed = Screen(), Screen(stop="128/200 motions"), Screen()
+    assert falsify_file(file, 200, 0, 1, whole.console)
+    with pytest.raises(Stopped):
+        falsify_file(file, 200, 0, 1, killed.console)
+    assert falsify_file(file, 200, 0, 1, resumed.console)
+    done = [
+        [text for text in ("64/200", "128/200", "192/200", "200/200") if text in screen.text]
+        for screen in (whole, resumed)
+    ]
+    assert done == [["64/200", "128/200", "192/200", "200/200"], ["192/200", "200/200"]]
+    assert resumed.text.splitlines()[-1] == whole.text.splitlines()[-1]
     assert [path.name for path in tmp_path.iterdir()] == ["000.json"]
 
 

@@ -2,12 +2,17 @@
 
 import json
 import os
+import pickle
 import random
 import re
 
+import numpy as np
 import pytest
 
 from rtcd_jax.certificate import check
+from rtcd_jax.cli import main as cli
+from tests.certificate import swing
+from tests.certificate.folder import folder_with
 from tests.certificate.test_check import escapes, leaves, mutated, resealed
 
 FORGED = "PROVED in continuous time, by exact arithmetic, for the model of your dreams"
@@ -217,6 +222,79 @@ def test_a_folder_without_an_export(content, asked, tmp_path):
     code, out, err = asked(content, "--controller", str(tmp_path))
     assert (code, out) == (2, "")
     assert "export.json: No such file or directory" in err
+
+
+# Run folders and certificates before certify and falsify --------------------------------------------------------------
+
+ELITES = {
+    "a gain that is none": (lambda a, r: a["K"].__setitem__((1, 0, 0), np.nan), "numbers in K that are not finite"),
+    "no mass": (lambda a, r: r["parameters"].pop("m"), "no certificate without the pendulum's m"),
+    "a mass of nothing": (lambda a, r: r["parameters"].update(m=0.0), "parameters.m: = 0: must be > 0"),
+    "the least mass": (lambda a, r: r["parameters"].update(m=5e-324), "rates[0][0][1]: must be a double"),
+    "a mass in words": (lambda a, r: r["parameters"].update(m="one"), "the elite's parameters.m cannot be read"),
+    "a list of parameters": (lambda a, r: r.update(parameters=[1]), "the elite's parameters cannot be read"),
+    "a list of robots": (lambda a, r: r.update(plant=["pendulum"]), "the elite's plant cannot be read"),
+    "limits in words": (lambda a, r: r.update(state_limits=["a", "b"]), "the elite's state_limits cannot be read"),
+    "a policy in words": (
+        lambda a, r: r.update(policy={"discount": "x"}),
+        "the elite's policy.discount cannot be read",
+    ),
+    "no weight on the input": (lambda a, r: a.update(R=0 * a["R"]), "the elite's R is not positive definite"),
+    "no time": (lambda a, r: a.update(time=0 * a["time"]), "dt: must be > 0"),
+    "uneven knots": (lambda a, r: a.update(time=a["time"] ** 2), "knots that are not evenly spaced"),
+}
+
+
+@pytest.mark.parametrize("elite", ELITES)
+def test_an_elite_that_cannot_be_claimed_is_told_in_a_line(elite, tmp_path, capsys):
+    arrays, record = swing.elite()
+    arrays = {key: np.array(value) for key, value in arrays.items()}
+    record = json.loads(json.dumps(record))
+    changed, reason = ELITES[elite]
+    changed(arrays, record)
+    run = folder_with(tmp_path / "run", arrays, record)
+    assert cli.main(["certify", str(run)]) == 2
+    err = capsys.readouterr().err
+    assert reason in err
+    assert len(err.splitlines()) == 1
+
+
+@pytest.mark.parametrize("file", ["elites/000.json", "certificates/summary.json"])
+def test_deep_files_of_a_run_are_told_in_a_line(file, tmp_path, capsys):
+    run = folder_with(tmp_path / "run", *swing.elite())
+    (run / file).write_text("[" * 100_000)
+    assert cli.main(["certify", str(run)]) == 2
+    err = capsys.readouterr().err
+    assert f"cannot read {run / file}" in err
+    assert len(err.splitlines()) == 1
+
+
+CERTIFICATES = {
+    "flat": (lambda c: c["goal"].update(axes=[["0x0p+0"] * 2] * 2), "Singular matrix"),
+    "no intervals": (lambda c: c.update(funnel=[]), "funnel: has no intervals"),
+    "a moment": (lambda c: c["claim"].update(dt=(1e-300).hex()), "claim.dt: cannot be simulated"),
+    "an eternity": (lambda c: c["claim"].update(dt=(1e300).hex()), "claim.dt: cannot be simulated"),
+    "a funnel in words": (lambda c: c.update(funnel="ab"), "is no certificate"),
+    "a number": (lambda c: c.update(goal=3), "is no certificate"),
+    "a forged key": (lambda c: c["claim"].update({f"{ESCAPE}\n": 1}), r"lacks some: \x1b[2K\r\n"),
+}
+
+
+@pytest.mark.parametrize("certificate", CERTIFICATES)
+def test_what_cannot_be_simulated_is_told_in_a_line(certificate, content, tmp_path, capsys):
+    changed, reason = CERTIFICATES[certificate]
+    changed(content)
+    path = tmp_path / "x.json"
+    path.write_text(json.dumps(resealed(content)))
+    assert cli.main(["falsify", str(path), "--rollouts", "50", "--workers", "1"]) == 2
+    err = capsys.readouterr().err
+    assert reason in err
+    assert len(err.splitlines()) == 1
+
+
+def test_a_refusal_goes_from_process_to_process():
+    refused = pickle.loads(pickle.dumps(check.Refused("goal", "no\n")))
+    assert str(refused) == r"goal: no\n"
 
 
 # A thousand files -----------------------------------------------------------------------------------------------------

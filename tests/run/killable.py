@@ -12,7 +12,7 @@ from pathlib import Path
 
 import jax
 
-from rtcd_jax.cli.main import LOST_PROCESS
+from rtcd_jax.cli.exits import Exit
 from rtcd_jax.system.cluster import Cluster, Lost, join
 
 
@@ -29,7 +29,7 @@ def main(path, mode, seconds, devices="1", port=None, processes="1", index="0"):
         drive(Path(path), experiment(mode), float(seconds), cluster)
     except Lost as error:
         print(error, flush=True)
-        os._exit(LOST_PROCESS)
+        os._exit(Exit.LOST_PROCESS)
 
 
 if __name__ == "__main__":

@@ -1,6 +1,5 @@
 """A whole run, small in every number: its folder, its resumption after kills, its promise before the witnesses."""
 
-import io
 import json
 import os
 import random
@@ -22,9 +21,9 @@ from rtcd_jax.elite.records import elite_names, read_elite, read_generations
 from rtcd_jax.run import optimize as run
 from rtcd_jax.run.optimize import LAST_FILE
 from rtcd_jax.system.cluster import Cluster
-from rtcd_jax.system.console import Console
 from rtcd_jax.system.errors import UserError
 from rtcd_jax.types import Status
+from tests.consoles import Screen
 from tests.paths import ROOT
 from tests.search.fake_evaluation import bowl, population
 
@@ -59,8 +58,7 @@ class Small:
         self.environment = cache | os.environ | devices
 
     def start(self, verb: str, *arguments) -> subprocess.Popen:
-        code = "import sys; from rtcd_jax.cli.main import main; sys.exit(main(sys.argv[1:]))"
-        command = [sys.executable, "-u", "-c", code, verb, *map(str, arguments)]
+        command = [sys.executable, "-u", "-m", "rtcd_jax", verb, *map(str, arguments)]
         pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
         return subprocess.Popen(command, cwd=ROOT, env=self.environment, **pipes)
 
@@ -268,8 +266,13 @@ def _run_with(monkeypatch, evaluate, folder):
     monkeypatch.setattr(run, "make_evaluate", lambda problem: evaluate)
     monkeypatch.setattr(run, "resample", lambda problem, effort, row, key: eqx.tree_at(
         lambda e: e.status, row, jnp.int32(Status.FUNNEL_EMPTY)))  # fmt: skip
-    with Console(io.StringIO()) as console:
-        run.optimize(configuration.parse(SMALL), folder, console, Cluster.of())
+    screen = Screen()
+    try:
+        with screen.console as console:
+            run.optimize(configuration.parse(SMALL), folder, console, Cluster.of())
+    finally:
+        assert f"generation {GENERATIONS}/{GENERATIONS}  best" in screen.text, "drawn on the terminal"
+        assert "compiled  elapsed 0:0" in screen.text
 
 
 def test_a_run_without_any_funnel_says_why(monkeypatch, tmp_path):

@@ -60,6 +60,7 @@ import numpy as np
 from rtcd_jax.system.cluster import Cluster
 from rtcd_jax.run.sharding import spread
 from tests.search.fake_evaluation import bowl
+from tests.paths import ROOT
 from tests.pipeline import same
 from tests.run.test_sharding import KEY, genomes_of
 assert len(jax.devices()) == 4

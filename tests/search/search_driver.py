@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 import yaml
 
-from rtcd_jax.cli.main import PREEMPTED
+from rtcd_jax.cli.exits import Exit
 from rtcd_jax.config import load as configuration
 from rtcd_jax.run import folder as storage
 from rtcd_jax.run.sharding import spread
@@ -66,7 +66,7 @@ def drive(path, config, seconds=0.0, cluster=None):
             folder.save(state, int(state.generation))
             print("preempted", int(state.generation), flush=True)
             part()
-            os._exit(PREEMPTED)
+            os._exit(Exit.PREEMPTED)
         folder.save(state, int(state.generation))
         again = jax.device_get(bowl(state.elites.evaluation.genome, search.last_key(plan)))
         cluster.on_first(lambda: folder.write_elites(results(search.finish(plan, state, again))))

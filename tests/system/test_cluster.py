@@ -10,7 +10,7 @@ import sys
 
 import pytest
 
-from rtcd_jax.cli.main import LOST_PROCESS, PREEMPTED
+from rtcd_jax.cli.exits import Exit
 from tests.paths import ROOT
 from tests.run.test_folder import driver, end, results
 from tests.run.test_optimize import Small, contents
@@ -84,7 +84,7 @@ def test_if_one_is_killed_the_other_ends_soon_and_the_run_goes_on_exactly(tmp_pa
     after(processes[victim], 4)
     processes[victim].kill()
     output = end(processes[1 - victim])
-    ends = {1: (LOST_PROCESS,), 0: (LOST_PROCESS, -signal.SIGABRT)}[victim]
+    ends = {1: (Exit.LOST_PROCESS,), 0: (Exit.LOST_PROCESS, -signal.SIGABRT)}[victim]
     assert processes[1 - victim].returncode in ends, output
     assert "lost another process of this run" in output or "another task died" in output
     end(processes[victim])
@@ -100,7 +100,7 @@ def test_asked_to_stop_both_save_and_leave_and_one_process_goes_on_exactly(tmp_p
     after(processes[1], 4)
     processes[1].send_signal(signal.SIGTERM)
     outputs = [end(process) for process in processes]
-    assert [process.returncode for process in processes] == [PREEMPTED, PREEMPTED], outputs
+    assert [process.returncode for process in processes] == [Exit.PREEMPTED, Exit.PREEMPTED], outputs
     (done,) = {int(re.search(r"^preempted (\d+)$", output, re.MULTILINE).group(1)) for output in outputs}
     assert 4 < done < 24
     assert finished_by_one(tmp_path / "run", devices) == done
@@ -113,7 +113,7 @@ def test_asked_to_stop_a_process_alone_saves_and_leaves(tmp_path, whole):
     after(process, 3)
     process.send_signal(signal.SIGTERM)
     output = end(process)
-    assert process.returncode == PREEMPTED, output
+    assert process.returncode == Exit.PREEMPTED, output
     done = int(re.search(r"^preempted (\d+)$", output, re.MULTILINE).group(1))
     assert finished_by_one(tmp_path / "run", 2) == done
     assert results(tmp_path / "run") == whole

@@ -1,76 +1,69 @@
-"""What a run says on a terminal and into a file."""
+"""What a verb says on a terminal and into a file."""
 
 import io
 import math
-from dataclasses import replace
 
 import pytest
-from rich.console import Console as Terminal
 
-from rtcd_jax.system.console import Console, Progress
-
-NOW = Progress(
-    generation=3,
-    generations=60,
-    best=123.4567,
-    median=45.6,
-    feasible=0.875,
-    rate=512.3,
-    elapsed=12.4,
-    left=3725.0,
-    failures={"TRAJECTORY_NOT_SOLVED": 3, "NOT_FINITE": 0, "FUNNEL_EMPTY": 13},
-)
-LINE = (
-    "generation  3/60  best 123.46 (sampled)  median 45.6  feasible  88%  512 candidates/s  elapsed 0:12  left 1:02:05"
-    "  failed: 3 trajectory_not_solved, 13 funnel_empty"
-)
+from rtcd_jax.system import console as consoles
+from rtcd_jax.system.console import Clock, Console, Progress, duration, table, times
+from tests.consoles import Screen
 
 
 def test_plain_lines_into_a_file():
     stream = io.StringIO()
     with Console(stream) as console:
         console.message("compiling [1/2]")
-        console.progress(NOW)
-        console.progress(replace(NOW, generation=4, failures={}))
-    first, second, third = stream.getvalue().splitlines()
-    assert first == "compiling [1/2]"
-    assert second == LINE
-    assert third == LINE.replace(" 3/60", " 4/60").split("  failed")[0]
+        console.progress(Progress(1, 2, "generation 1/2"))
+        console.progress(Progress(2, 2, "generation 2/2"))
+    assert stream.getvalue() == "compiling [1/2]\ngeneration 1/2\ngeneration 2/2\n"
 
 
 def test_a_line_reaches_the_file_at_once(tmp_path):
     path = tmp_path / "log"
     with path.open("w") as stream, Console(stream) as console:
-        console.progress(NOW)
-        assert path.read_text() == LINE + "\n"
+        console.progress(Progress(1, 2, "half"))
+        assert path.read_text() == "half\n"
 
 
 def test_one_live_line_on_a_terminal():
-    stream = io.StringIO()
-    terminal = Terminal(file=stream, force_terminal=True, width=300, color_system=None)
-    with Console(terminal=terminal) as console:
-        for generation in (1, 2, 3):
-            console.progress(replace(NOW, generation=generation))
+    screen = Screen()
+    with screen.console as console:
+        for done in (1, 2, 3):
+            console.progress(Progress(done, 3, f"part {done}/3"))
         console.message("done")
-    frames = stream.getvalue()
-    assert frames.count("\n") < 6
-    assert frames.index(" 1/60") < frames.index(" 3/60") < frames.index("done")
-    assert "\x1b[2K" in frames, "the line is erased before it is drawn again"
+    assert screen.text.count("\n") < 6
+    assert screen.text.index(" 1/3") < screen.text.index(" 3/3") < screen.text.index("done")
+    assert "\x1b[2K" in screen.text, "the line is erased before it is drawn again"
 
 
 @pytest.mark.parametrize(
     ("seconds", "shown"),
-    [(0.4, "0:00"), (59.4, "0:59"), (59.6, "1:00"), (3599.6, "1:00:00"), (math.inf, "unknown"), (math.nan, "unknown")],
-)
+    [
+        (0.4, "0:00"), (59.4, "0:59"), (59.6, "1:00"), (3599.6, "1:00:00"), (3725, "1:02:05"), (math.inf, "unknown"),
+        (math.nan, "unknown"),
+    ],
+)  # fmt: skip
 def test_durations(seconds, shown):
-    assert f"left {shown}  failed" in str(replace(NOW, left=seconds))
+    assert duration(seconds) == shown
+    assert times(12.4, seconds) == f"elapsed 0:12  left {shown}"
 
 
-def test_a_generation_that_compiled_says_nothing_of_the_others():
-    assert "compiled  elapsed 0:12  left unknown" in str(replace(NOW, rate=math.nan, left=math.nan))
+def test_what_an_earlier_call_did_says_nothing_about_the_time_that_is_left(monkeypatch):
+    now = 100.0
+    monkeypatch.setattr(consoles.time, "monotonic", lambda: now)
+    clock = Clock(before=6)
+    now = 110.0
+    assert clock.times(6, 10) == "elapsed 0:10  left unknown"
+    assert clock.times(8, 10) == "elapsed 0:10  left 0:10"
+    assert clock.times(10, 10) == "elapsed 0:10  left 0:00"
 
 
-def test_nothing_feasible_yet():
-    assert "best none (sampled)  median none  feasible   0%" in str(
-        replace(NOW, best=math.nan, median=math.nan, feasible=0)
-    )
+def test_a_table_is_text_whatever_the_terminal_is(monkeypatch):
+    monkeypatch.setenv("FORCE_COLOR", "1")
+    monkeypatch.setenv("COLUMNS", "10")
+    shown = table(("name", "value"), [("a", "1.5"), ("long name", "2 [m]"), ("short row",)], "title", left={"name"})
+    assert "\x1b" not in shown
+    lines = [line.rstrip() for line in shown.splitlines() if line.strip()]
+    assert lines[0].strip() == "title"
+    assert lines[-3:] == ["  a             1.5", "  long name   2 [m]", "  short row"]

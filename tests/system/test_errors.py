@@ -1,5 +1,7 @@
 """What others wrote reaches a terminal as text alone."""
 
+import pickle
+
 import pytest
 
 from rtcd_jax.system.errors import ConfigError, Problem, printable
@@ -37,3 +39,10 @@ def test_long_text_ends_in_dots():
 def test_an_error_names_a_hostile_key_on_its_own_line():
     error = ConfigError([Problem(("search", "\x1b[2J\nrtcd: all is well"), "unknown key", "\x1b]0;x\x07")], "x.yaml")
     assert str(error) == r"x.yaml: search.\x1b[2J\nrtcd: all is well = '\x1b]0;x\x07': unknown key"
+
+
+@pytest.mark.parametrize("count", [1, 2])
+def test_an_error_comes_whole_out_of_a_worker_process(count):
+    error = ConfigError([Problem(("search", "seed"), "must be >= 0", -1)] * count, "x.yaml")
+    again = pickle.loads(pickle.dumps(error))
+    assert (str(again), again.problems, again.source) == (str(error), error.problems, error.source)

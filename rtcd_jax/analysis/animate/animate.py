@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol, final
+from typing import TYPE_CHECKING, Any, final
 
 import numpy as np
 from jaxtyping import Float
@@ -21,6 +21,7 @@ from rtcd_jax.config.load import Config
 from rtcd_jax.elite.elite import Elite, initial_and_best
 from rtcd_jax.elite.funnel import FunnelInterpolant
 from rtcd_jax.elite.records import read_config, require_elites
+from rtcd_jax.system.console import Clock, Console, Progress
 from rtcd_jax.system.errors import UserError
 from rtcd_jax.system.files import make_folder, writing
 
@@ -38,23 +39,6 @@ MARGIN = 1.15
 NEAR = 0.9
 """V/rho of the disturbed start."""
 _INK, _GOOD, _BAD = (28, 39, 51), (0, 114, 80), (190, 60, 0)
-
-
-class Console(Protocol):
-    def message(self, text: str, /) -> None: ...
-    def progress(self, now: Any, /) -> None: ...
-
-
-@final
-@dataclass(frozen=True)
-class Rendered:
-    """Frames done of all, as a console shows progress."""
-
-    generation: int
-    generations: int
-
-    def __str__(self) -> str:
-        return f"frame {self.generation} of {self.generations}"
 
 
 @final
@@ -145,7 +129,7 @@ def _disturbed(elite: Elite, seed: int) -> np.ndarray:
 def _frames(columns: Sequence[Column], size: tuple[int, int], console: Console) -> Iterator["Image"]:
     from PIL import Image
 
-    frames = len(columns[0].motions.time)
+    frames, clock = len(columns[0].motions.time), Clock()
     with contextlib.ExitStack() as stack:
         cameras = [stack.enter_context(Camera(column.model, SIDE, SIDE)) for column in columns]
         paths = [column.positions.reshape(-1, column.positions.shape[-1]) for column in columns]
@@ -161,7 +145,7 @@ def _frames(columns: Sequence[Column], size: tuple[int, int], console: Console) 
                     frame.paste(panel, (i * (SIDE + GAP), row * (SIDE + GAP)))
             yield frame
             if (k + 1) % RATE == 0 or k + 1 == frames:
-                console.progress(Rendered(k + 1, frames))
+                console.progress(Progress(k + 1, frames, f"frame {k + 1} of {frames}  {clock.times(k + 1, frames)}"))
 
 
 def _write_on(panel: "Image", column: Column, k: int, row: int) -> None:

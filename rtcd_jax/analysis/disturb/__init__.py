@@ -9,10 +9,11 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from rtcd_jax.analysis.disturb.comparison import Console, Contest, Meter, motions, read_contest, run
+from rtcd_jax.analysis.disturb.comparison import Contest, Meter, motions, read_contest, run
 from rtcd_jax.analysis.disturb.experiments import FACTORS, SIZES, TIMES, impulse, off_nominal, robustness, troubles
 from rtcd_jax.analysis.disturb.figures import draw_disturbance
 from rtcd_jax.analysis.disturb.scenarios import Lanes, Outcome
+from rtcd_jax.system.console import Console
 from rtcd_jax.system.files import make_folder, replace_json
 
 FOLDER = "disturbance"

@@ -1,11 +1,10 @@
 """The controllers that are compared, and what runs their lanes in batches, with progress."""
 
 import math
-import time
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol, final
+from typing import Any, final
 
 import jax
 import jax.numpy as jnp
@@ -27,6 +26,7 @@ from rtcd_jax.elite.elite import Elite, initial_and_best
 from rtcd_jax.elite.simulators import dynamics_of
 from rtcd_jax.plants import plant_class
 from rtcd_jax.plants.base import Plant
+from rtcd_jax.system.console import Clock, Console, Progress, times
 
 BATCH = 2048
 """Lanes in the compiled program."""
@@ -34,11 +34,6 @@ TELLING = 0.02
 """Share of the work from which on the time that is left can be told; before it, most was compilation."""
 REPORTED = 5.0
 """Least time between two lines of progress [s]."""
-
-
-class Console(Protocol):
-    def message(self, text: str, /) -> None: ...
-    def progress(self, now: Any, /) -> None: ...
 
 
 @final
@@ -63,38 +58,23 @@ class Contest:
 
 
 @final
-@dataclass(frozen=True)
-class Progress:
-    """All experiments together; `generation` of `generations` thousandths are done."""
-
-    generation: int
-    generations: int
-    experiment: str
-    elapsed: float
-
-    def __str__(self) -> str:
-        share = self.generation / self.generations
-        left = f"  left {self.elapsed * (1 - share) / share:.0f} s" if share >= TELLING else ""
-        return f"{self.experiment:12} {share:4.0%}  elapsed {self.elapsed:.0f} s{left}"
-
-
-@final
 class Meter:
     """Tells a console how much of all motions is done; of `motions` of `seconds` each."""
 
     def __init__(self, console: Console, motions: int):
         self._console, self._motions = console, motions
-        self._done = 0.0
-        self._began = self._told = time.monotonic()
+        self._done = self._told = 0.0
+        self._clock = Clock()
 
     def tick(self, experiment: str, motions: float) -> None:
         """That so many more motions are over."""
         self._done += motions
-        now = time.monotonic()
-        if now - self._told >= REPORTED:
-            self._told = now
-            share = min(1000, round(1000 * self._done / self._motions))
-            self._console.progress(Progress(share, 1000, experiment, now - self._began))
+        elapsed = self._clock.elapsed
+        if elapsed - self._told >= REPORTED:
+            self._told = elapsed
+            share = min(1.0, self._done / self._motions)
+            shown = self._clock.times(share, 1) if share >= TELLING else times(elapsed, math.nan)
+            self._console.progress(Progress(share, 1, f"{experiment:12} {share:4.0%}  {shown}"))
 
 
 def read_contest(folder: Path, console: Console) -> Contest:

@@ -9,7 +9,7 @@ import io
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol, final
+from typing import Any, final
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -23,6 +23,7 @@ from rtcd_jax.config.load import Config
 from rtcd_jax.elite.elite import Elite
 from rtcd_jax.elite.funnel import FunnelInterpolant
 from rtcd_jax.elite.records import elite_name, read_config
+from rtcd_jax.system.console import Console
 from rtcd_jax.system.errors import UserError
 from rtcd_jax.system.files import make_folder, replace, replace_json
 
@@ -31,10 +32,6 @@ LEAST = 1e-4
 LEAST_SAMPLES = 2
 EVEN = 1e-6
 """Share of an interval by which samples as far apart as knots may miss it."""
-
-
-class Console(Protocol):
-    def message(self, text: str, /) -> None: ...
 
 
 @final

@@ -73,7 +73,8 @@ def refresh(folder: Path, console: Console | None = None) -> Path | None:
 def draw_figures(run: Run) -> list[Path]:
     """The figures of one run, NAME.png and .pdf in `run.figures`. Raises UserError if they cannot be written."""
     over = draw_over([run], run.figures, "overlay")
-    return over + [path for draw in (draw_funnels, draw_levels, draw_courses, draw_convergence) for path in draw(run)]
+    of_search = (draw_courses, draw_convergence) if run.generations else ()
+    return over + [path for draw in (draw_funnels, draw_levels, *of_search) for path in draw(run)]
 
 
 def render(runs: Sequence[Run]) -> str:
@@ -97,8 +98,11 @@ def _header(runs: Sequence[Run]) -> str:
     about = f"{first.plant.name}, {first.trajectory.knots} knots"
     if len(runs) == 1:
         search = first.search
-        about += f"; {search.mode} search for the largest {words(search.objective)}, "
-        about += f"{search.generations} generations of {search.population}"
+        if runs[0].generations:
+            about += f"; {search.mode} search for the largest {words(search.objective)}, "
+            about += f"{search.generations} generations of {search.population}"
+        else:
+            about += "; an external funnel, audited"
         cards = "".join(_card(*card) for card in _headlines(runs[0]))
         told = f'<p class="candidate">{_candidate(runs[0])}</p>'
     else:
@@ -159,8 +163,11 @@ def _sections(runs: Sequence[Run], figures: Mapping[str, Any]) -> Iterator[str]:
     if alone:
         named = [name for name in figures if name.startswith("course")]
         boxes = "".join(_plot(name, "small") for name in named)
-        yield _section("Search", _plot("convergence", "tall"), _note("Volumes are sampled, as the search saw them."))
-        yield _section("Design and weights", f'<div class="grid">{boxes}</div>')
+        if alone.generations:
+            yield _section(
+                "Search", _plot("convergence", "tall"), _note("Volumes are sampled, as the search saw them.")
+            )
+            yield _section("Design and weights", f'<div class="grid">{boxes}</div>')
         yield _section("Elites", _table(tables.elites(alone)), _note("Click a heading to sort."))
     else:
         told = "Sampled volumes, each search's own objective: solid the best so far, dotted each generation's median."

@@ -30,6 +30,8 @@ def plots(runs: Sequence[Run]) -> dict[str, Plot]:
     if len(runs) > 1:
         found["convergence"] = progress_plot(runs)
         return found
+    if not runs[0].generations:  # nothing was searched
+        return found
     found["convergence"] = convergence_plot(runs[0])
     index = _numbers(column(runs[0].generations, "index"))
     for i, course in enumerate(courses(config, runs[0].generations)):

@@ -21,7 +21,7 @@ from rtcd_jax.elite.records import (
     read_elite,
     read_generations,
 )
-from rtcd_jax.system.console import Console, silent
+from rtcd_jax.system.console import Console, Progress, silent
 from rtcd_jax.system.errors import UserError
 from rtcd_jax.system.files import read_json, reading
 
@@ -33,6 +33,9 @@ INITIALS = (BLUE, "#5F6B7A", "#8C6D31", "#7A5195")
 """Of their initial candidates, where they differ."""
 
 _ADVICE = "remove it, or make it again"
+AUDIT = "audit.json"
+"""In the folders that `rtcd audit` makes."""
+
 _OF_A_GENERATION = (
     "index", "evaluations", "objective", "best", "median", "best_so_far", "feasible", "counts", "sigma", "restarts",
     "genomes", "volumes",
@@ -76,19 +79,6 @@ class Certificate:
     seconds: float = 0.0
     sampled: Mapping[str, float] = field(default_factory=dict)
     shown: Mapping[str, float] = field(default_factory=dict)
-
-
-@final
-@dataclass(frozen=True)
-class Checking:
-    """How far the checker is with a certificate, in intervals."""
-
-    file: Path
-    done: int
-    total: int
-
-    def __str__(self) -> str:
-        return f"checking {self.file}  interval {self.done}/{self.total}"
 
 
 @final
@@ -166,8 +156,13 @@ def _require_shown(name: str, elite: Elite) -> None:
 
 
 def read_search(path: Path) -> list[dict[str, Any]]:
-    """The generations of a run. Raises UserError if there are none."""
+    """The generations of a run, none of an audited funnel, which nobody searched.
+
+    Raises UserError if others have none.
+    """
     generations = read_generations(path) if (path / "generations.jsonl").is_file() else []
+    if not generations and (path / AUDIT).is_file():
+        return []
     if not generations:
         raise UserError(f"{path} has no generations yet: begin the run first")
     for number, record in enumerate(generations, 1):
@@ -246,7 +241,7 @@ def _telling(console: Console, file: Path) -> Callable[[int, int], None]:
         nonlocal told
         if time.monotonic() - told >= 1:
             told = time.monotonic()
-            console.progress(Checking(file, done, of))
+            console.progress(Progress(done, of, f"checking {file}  interval {done}/{of}"))
 
     return progress
 

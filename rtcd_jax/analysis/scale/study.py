@@ -8,19 +8,13 @@ import platform
 import statistics
 import subprocess
 import sys
-import time
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, final
-
-from rich.box import SIMPLE
-from rich.console import Console as Terminal
-from rich.table import Table
+from typing import Any
 
 from rtcd_jax.analysis.scale.figures import draw
 from rtcd_jax.config.load import Config, config_hash
-from rtcd_jax.system.console import Console
+from rtcd_jax.system.console import Clock, Console, Progress, duration, table
 from rtcd_jax.system.files import make_folder, plain, replace, writing
 
 POINTS, TABLE = "points.jsonl", "table.csv"
@@ -29,20 +23,6 @@ _MEMORY_WORDS = ("RESOURCE_EXHAUSTED", "Out of memory", "MemoryError", "bad_allo
 _KILLED = -9
 
 Point = Mapping[str, Any]
-
-
-@final
-@dataclass(frozen=True)
-class Progress:
-    """`done` of `total` points."""
-
-    done: int
-    total: int
-    point: str
-    elapsed: float
-
-    def __str__(self) -> str:
-        return f"point {self.done}/{self.total}: {self.point}  elapsed {self.elapsed:.0f} s"
 
 
 def study(
@@ -58,7 +38,7 @@ def study(
     make_folder(folder)
     found = {_place(point): point for point in _kept(folder / POINTS, mark)}
     grid = [(population, count) for population in sorted(set(populations)) for count in sorted(set(devices))]
-    began = time.monotonic()
+    clock = Clock()
     for index, (population, count) in enumerate(grid):
         if (population, count) not in found:
             console.message(f"population {population}, {count} devices: a process of its own, which compiles first")
@@ -66,8 +46,9 @@ def study(
             with writing(folder / POINTS), (folder / POINTS).open("a") as file:
                 file.write(json.dumps(plain(point)) + "\n")
             found[population, count] = point
-        summary = _sentence(found[population, count])
-        console.progress(Progress(index + 1, len(grid), summary, time.monotonic() - began))
+        done, total = index + 1, len(grid)
+        text = f"point {done}/{total}: {_sentence(found[population, count])}  elapsed {duration(clock.elapsed)}"
+        console.progress(Progress(done, total, text))
     rows = [row_of(found[place]) for place in grid]
     _write_table(folder / TABLE, rows)
     pictures = draw(rows, folder)
@@ -164,30 +145,26 @@ def _write_table(path: Path, rows: Sequence[Point]) -> None:
 
 
 def _table(rows: Sequence[Point]) -> str:
-    table = Table(box=SIMPLE)
     headings = (
         "population", "devices", "candidates/s", "min .. max", "device ms", "CPU ms", "efficiency", "overhead",
         "compilation", "memory",
     )  # fmt: skip
-    for heading in headings:
-        table.add_column(heading, justify="right")
     shares = efficiencies(rows)
-    for row in rows:
-        place = row["population"], row["devices"]
-        if row["failed"]:
-            table.add_row(*map(str, place), row["failed"])
-            continue
-        table.add_row(
-            *map(str, place),
-            f"{row['candidates_per_s']:.4g}",
-            f"{row['candidates_per_s_min']:.4g} .. {row['candidates_per_s_max']:.4g}",
-            f"{row['device_ms_per_candidate']:.3g}",
-            f"{row['cpu_ms_per_candidate']:.3g}",
-            f"{shares[place]:.2f}",
-            f"{row['overhead']:.1%}",
-            f"{row['compilation_s']:.1f} s",
-            f"{row['peak_memory_mb']:.0f} MB",
-        )
-    text = io.StringIO()
-    Terminal(file=text, width=132).print(table)
-    return text.getvalue().rstrip()
+    return table(headings, (_cells(row, shares) for row in rows))
+
+
+def _cells(row: Point, shares: Mapping[tuple[int, int], float]) -> list[str]:
+    place = row["population"], row["devices"]
+    if row["failed"]:
+        return [*map(str, place), row["failed"]]
+    return [
+        *map(str, place),
+        f"{row['candidates_per_s']:.4g}",
+        f"{row['candidates_per_s_min']:.4g} .. {row['candidates_per_s_max']:.4g}",
+        f"{row['device_ms_per_candidate']:.3g}",
+        f"{row['cpu_ms_per_candidate']:.3g}",
+        f"{shares[place]:.2f}",
+        f"{row['overhead']:.1%}",
+        f"{row['compilation_s']:.1f} s",
+        f"{row['peak_memory_mb']:.0f} MB",
+    ]

@@ -4,23 +4,19 @@ import contextlib
 import functools
 import hashlib
 import io
-import time
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import as_completed
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
 from typing import NamedTuple, final
 
 import numpy as np
-from rich.box import SIMPLE
-from rich.console import Console as Terminal
-from rich.table import Table
 
 from rtcd_jax.analysis.verify.verification import Trial, Verification
 from rtcd_jax.elite.closed_loop import Outcome
 from rtcd_jax.elite.elite import Elite, NoFunnel
 from rtcd_jax.elite.records import INITIAL, elite_folder, require_elites
-from rtcd_jax.system.console import Console
+from rtcd_jax.system.console import Clock, Console, Progress, table
 from rtcd_jax.system.errors import UserError
 from rtcd_jax.system.files import make_folder, reading, replace, replace_json, writing
 from rtcd_jax.system.processes import processes
@@ -39,25 +35,6 @@ class Job(NamedTuple):
     seed: int
     witness: str
     chunk: int
-
-
-@final
-@dataclass(frozen=True)
-class Progress:
-    """`done` of `total` chunks, `fresh` of them since the start."""
-
-    done: int
-    total: int
-    fresh: int
-    failures: int
-    elapsed: float
-
-    def __str__(self) -> str:
-        left = self.elapsed * (self.total - self.done) / self.fresh
-        return (
-            f"{self.done}/{self.total} chunks of states  {self.failures} failures"
-            f"  elapsed {self.elapsed:.0f} s  left {left:.0f} s"
-        )
 
 
 def verify_run(folder: Path, states: int, seed: int, workers: int, console: Console) -> bool:
@@ -109,13 +86,13 @@ def _trial(folder: Path, funnel: str, states: int, seed: int) -> Trial:
 def _outcomes(jobs: Sequence[Job], parts: Path, workers: int, console: Console) -> dict[Job, Outcome]:
     """Of all jobs, those that are kept already read, the others done and kept."""
     found = {job: seen for job in jobs if (seen := _kept(_part(parts, job))) is not None}
-    began, before = time.monotonic(), len(found)
+    clock, total = Clock(before=len(found)), len(jobs)
     for job, seen in _done([job for job in jobs if job not in found], workers):
         _keep(_part(parts, job), seen)
         found[job] = seen
         failures = sum(int(each.failed.sum()) for each in found.values())
-        done = len(found)
-        console.progress(Progress(done, len(jobs), done - before, failures, time.monotonic() - began))
+        text = f"{len(found)}/{total} chunks of states  {failures} failures  {clock.times(len(found), total)}"
+        console.progress(Progress(len(found), total, text))
     return {job: found[job] for job in jobs}
 
 
@@ -157,26 +134,25 @@ def _kept(part: Path) -> Outcome | None:
 
 
 def _table(verifications: Mapping[str, Verification]) -> str:
-    table = Table(box=SIMPLE, title="fresh random states of the funnels (promise: sampled rung)")
-    for heading in (
+    headings = (
         "funnel", "witness", "states", "left funnel", "left limits", "missed goal", "failure rate", "promised", "",
-    ):  # fmt: skip
-        table.add_column(heading, justify="left" if heading in ("funnel", "witness", "") else "right")
-    for name, verification in verifications.items():
-        for witness, outcome in verification.outcomes.items():
-            states = len(verification.knots)
-            lower, upper = verification.interval(witness)
-            table.add_row(
-                name,
-                witness,
-                f"{states}",
-                f"{outcome.left_funnel.sum()}",
-                f"{outcome.left_limits.sum()}",
-                f"{outcome.missed_goal.sum()}",
-                f"{verification.failures(witness) / states:.2g} [{lower:.2g}, {upper:.2g}]",
-                f"{verification.epsilon:g} ({verification.confidence:g})",
-                "kept" if verification.keeps(witness) else "BROKEN",
-            )
-    text = io.StringIO()
-    Terminal(file=text, width=132).print(table)
-    return text.getvalue().rstrip()
+    )  # fmt: skip
+    rows = (_row(funnel, trial, witness) for funnel, trial in verifications.items() for witness in trial.outcomes)
+    title = "fresh random states of the funnels (promise: sampled rung)"
+    return table(headings, rows, title, left={"funnel", "witness", ""})
+
+
+def _row(funnel: str, verification: Verification, witness: str) -> list[str]:
+    outcome, states = verification.outcomes[witness], len(verification.knots)
+    lower, upper = verification.interval(witness)
+    return [
+        funnel,
+        witness,
+        f"{states}",
+        f"{outcome.left_funnel.sum()}",
+        f"{outcome.left_limits.sum()}",
+        f"{outcome.missed_goal.sum()}",
+        f"{verification.failures(witness) / states:.2g} [{lower:.2g}, {upper:.2g}]",
+        f"{verification.epsilon:g} ({verification.confidence:g})",
+        "kept" if verification.keeps(witness) else "BROKEN",
+    ]

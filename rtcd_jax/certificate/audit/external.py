@@ -1,10 +1,10 @@
-"""A trajectory with its funnel from outside: a table of knots, as an elite that certificates can be about.
+"""External funnels: somebody's trajectory with its funnel, from tables, as an elite that certificates can be about.
 
-One row a knot after a row of headings, columns by their place: time [s], the states, the input (held until the next
-knot; the last one may be nan), rho, and the upper triangle of S row by row: B_k = {(x - x_k)'S_k (x - x_k) <= rho_k}.
+One table has a row a knot under a row of headings, columns by their place: time [s], the states, the input (held until
+the next knot; the last one may be nan), rho, and the upper triangle of S row by row: B_k = {(x - x_k)'S_k (x - x_k) <=
+rho_k}. Or two files: a trajectory with the first of these columns, and rho with all of S, a knot a column or a row.
 """
 
-import csv
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -16,16 +16,25 @@ from jaxtyping import Float
 from rtcd_jax.certificate.check import PLANTS, Plant
 from rtcd_jax.certificate.prove.closed_loop import linear
 from rtcd_jax.elite.elite import CLAIMED
-from rtcd_jax.system.errors import UserError, closest
+from rtcd_jax.system.delimited import number_in, read_table, shown
+from rtcd_jax.system.errors import UserError, closest, printable
 
 EVEN = 1e-6
 """Share of an interval by which the knots' times may be off an even grid."""
+SYMMETRIC = 1e-6
+"""Share of S's largest entry by which it may be asymmetric."""
+SMALLEST, LARGEST = 1e-12, 1e12
+"""Ends of the numbers that a robot, a cost or a table may have [SI units]."""
+DAMPINGS = {"b", "Beq", "Bp"}
+"""Parameters that may be zero."""
+CONFIDENCE = 0.99
+"""With which a verification must refute a claim, which is that no state fails."""
 AT_GOAL = 1e-3
 """How far the last state may be from the equilibrium that it stands for."""
 
 
-class Outside(NamedTuple):
-    """What a file claims of a robot; `goal` is the equilibrium at its last knot."""
+class ExternalFunnel(NamedTuple):
+    """What files claim of a robot; `goal` is the equilibrium at its last knot, `inputs` the file's own, one a knot."""
 
     name: str
     parameters: dict[str, float]
@@ -35,6 +44,7 @@ class Outside(NamedTuple):
     rho: Float[np.ndarray, " N+1"]
     S: Float[np.ndarray, "N+1 n n"]
     goal: Float[np.ndarray, " n"]
+    inputs: Float[np.ndarray, " N+1"]
 
     @property
     def plant(self) -> Plant:
@@ -53,52 +63,108 @@ class Outside(NamedTuple):
         return ball * self.rho ** (n / 2) / np.sqrt(np.linalg.det(self.S))
 
 
-def read_outside(path: Path, name: str, parameters: Mapping[str, float]) -> Outside:
-    """The file's trajectory and funnel.
+def read_external(path: Path, name: str, parameters: Mapping[str, float], funnel: Path | None = None) -> ExternalFunnel:
+    """The trajectory and funnel of one table, or of a trajectory and a `funnel` file.
 
     Raises:
-        UserError: an unknown plant or parameter, or a file that is not as the module says.
+        UserError: an unknown plant or parameter, a number out of its range, or files that are not as the module says.
     """
     if name not in PLANTS:
         raise UserError(f"--plant = {name!r}: unknown plant; {closest(name, tuple(PLANTS))}")
     plant = PLANTS[name]
-    wrong = parameters.keys() ^ set(plant.parameters)
-    if wrong:
-        names, differ = ", ".join(plant.parameters), ", ".join(sorted(wrong))
-        raise UserError(f"--parameters: must be those of the {name}, {names}; differ in {differ}")
-    table = _table(path, plant)
+    _require_parameters(plant, name, parameters)
     n = len(plant.states)
-    times, x, u, rho = table[:, 0], table[:, 1 : n + 1], table[:, n + 1], table[:, n + 2]
-    s = np.zeros((len(table), n, n))
-    rows, columns = np.triu_indices(n)
-    s[:, rows, columns] = s[:, columns, rows] = table[:, n + 3 :]
+    columns = f"time, {', '.join(plant.states)}, input"
+    if funnel is None:
+        entries = n * (n + 1) // 2
+        table = _numbers(path, n + 3 + entries, f"{columns}, rho, upper triangle of S", last=n + 1)
+        rho, s = table[:, n + 2], np.zeros((len(table), n, n))
+        rows, places = np.triu_indices(n)
+        s[:, rows, places] = s[:, places, rows] = table[:, n + 3 :]
+    else:
+        table = _numbers(path, n + 2, columns, last=n + 1)
+        rho, s = _levels_and_values(funnel, len(table), n)
+    times, x, inputs = table[:, 0], table[:, 1 : n + 1], table[:, n + 1]
     dt = (times[-1] - times[0]) / (len(times) - 1)
     if not dt > 0 or np.max(np.abs(np.diff(times) - dt)) > EVEN * dt:
         raise UserError(f"{path}: times must rise evenly, knot by knot")
     for what, holds in (("rho", rho > 0), ("S", np.linalg.eigvalsh(s)[:, 0] > 0)):
         if not np.all(holds):
-            raise UserError(f"{path}: {what} of knot {int(np.argmin(holds))} must be positive")
-    return Outside(name, dict(parameters), float(dt), x, u[:-1], rho, s, _goal(path, plant, x[-1]))
+            raise UserError(f"{funnel or path}: {what} of knot {int(np.argmin(holds))} must be positive")
+    external = ExternalFunnel(
+        name, dict(parameters), float(dt), x, inputs[:-1], rho, s, _goal(path, plant, x[-1]), inputs
+    )
+    with np.errstate(all="ignore"):
+        sizes = np.isfinite(external.volumes) & (external.volumes > 0)
+    if not np.all(sizes):
+        raise UserError(f"{funnel or path}: the volume of knot {int(np.argmin(sizes))} is beyond all numbers")
+    return external
 
 
-def _table(path: Path, plant: Plant) -> np.ndarray:
-    n = len(plant.states)
-    width = n + 3 + n * (n + 1) // 2
+def _require_parameters(plant: Plant, name: str, parameters: Mapping[str, float]) -> None:
+    wrong = parameters.keys() ^ set(plant.parameters)
+    if wrong:
+        names, differ = ", ".join(plant.parameters), ", ".join(sorted(printable(key, 30) for key in wrong))
+        raise UserError(f"--parameters: must be those of the {name}, {names}; differ in {differ}")
+    for key, value in parameters.items():
+        may_be_zero = key in DAMPINGS
+        if not (SMALLEST <= value <= LARGEST or (may_be_zero and value == 0)):
+            least = f"0, or {SMALLEST:g}" if may_be_zero else f"{SMALLEST:g}"
+            raise UserError(f"--parameters {key}={value}: must be a number from {least} to {LARGEST:g}")
+
+
+def _numbers(path: Path, width: int, columns: str, last: int | None = None) -> np.ndarray:
+    """The rows of `width` numbers; the last row's cell at place `last` may hold none, and is nan then."""
+    found = _matrix(path, f"a table of the columns {columns}", last)
+    if found.shape[1] != width or len(found) < 2:
+        shape = f"{len(found)} of {found.shape[1]}"
+        raise UserError(f"{path}: must have at least 2 rows of {width} finite numbers: {columns}; it has {shape}")
+    return found
+
+
+def _matrix(path: Path, what: str, last: int | None = None) -> np.ndarray:
+    """All numbers of a table, whatever stands above them."""
+    rows = list(read_table(path, what).rows)
+    if not rows:
+        raise UserError(f"{path} has no rows of numbers: must be {what}")
+    width = len(rows[0][1])
+    found = np.full((len(rows), width), math.nan)
+    for k, (line, cells) in enumerate(rows):
+        if len(cells) != width:
+            raise UserError(f"{path}, line {line} has {len(cells)} cells, the first row {width}: must be {what}")
+        for place, cell in enumerate(cells):
+            value = _number(cell)
+            found[k, place] = value
+            if not abs(value) <= LARGEST and not (k == len(rows) - 1 and place == last and not cell.strip("naNA")):
+                raise UserError(
+                    f"{path}, line {line}, cell {place + 1} = {shown(cell)}: must be a finite number, of at most "
+                    f"{LARGEST:g} in size; the file must be {what}"
+                )
+    return found
+
+
+def _number(cell: str) -> float:
     try:
-        with path.open(newline="") as file:
-            rows = list(csv.reader(file))[1:]
-        table = np.array([[float(cell) for cell in row] for row in rows if row])
-    except OSError as error:
-        raise UserError(f"{path}: {error.strerror}") from None
-    except ValueError as error:
-        raise UserError(f"{path}: must be a row of headings and rows of {width} numbers ({error})") from None
-    whole = table.ndim == 2 and table.shape[1] == width and len(table) > 1
-    if whole:
-        table[-1, n + 1] = 0
-    if not whole or not np.all(np.isfinite(table)):
-        columns = f"time, {', '.join(plant.states)}, input, rho, upper triangle of S"
-        raise UserError(f"{path}: must have at least 2 rows of {width} finite numbers: {columns}")
-    return table
+        return number_in(cell)
+    except ValueError:
+        return math.nan
+
+
+def _levels_and_values(path: Path, knots: int, n: int) -> tuple[np.ndarray, np.ndarray]:
+    """rho [knots] and S [knots n n] of a file with a knot a column, or a knot a row: rho, then S row by row."""
+    found = _matrix(path, f"a funnel file: rho and the {n * n} entries of S of every knot")
+    size = 1 + n * n
+    for numbers in (found.T, found):
+        if numbers.shape == (knots, size):
+            s = numbers[:, 1:].reshape(knots, n, n)
+            if np.allclose(s, np.swapaxes(s, 1, 2), rtol=SYMMETRIC, atol=SYMMETRIC * np.abs(s).max()):
+                return numbers[:, 0], (s + np.swapaxes(s, 1, 2)) / 2
+    if (knots, size) in (found.shape, found.T.shape):
+        raise UserError(f"{path}: an S is not symmetric")
+    raise UserError(
+        f"{path} has {found.shape[0]} rows of {found.shape[1]} numbers: must have {size} rows (rho, S row by row) of "
+        f"{knots} numbers, one for each knot of the trajectory, or {knots} rows of {size}"
+    )
 
 
 def _goal(path: Path, plant: Plant, last: np.ndarray) -> np.ndarray:
@@ -119,45 +185,54 @@ class Cost(NamedTuple):
     limits: Float[np.ndarray, " n"]
 
     @classmethod
-    def of(cls, outside: Outside, q: Sequence[float], r: float, limits: Sequence[float]) -> "Cost":
+    def of(cls, external: ExternalFunnel, q: Sequence[float], r: float, limits: Sequence[float]) -> "Cost":
         """Checked; no limits at all are infinite ones.
 
         Raises:
             UserError: a number that is not positive, or too few or too many.
         """
-        n = len(outside.goal)
+        n = len(external.goal)
         limits = limits or (math.inf,) * n
         for name, values in (("q", q), ("state_limits", limits)):
-            if len(values) != n or not all(value > 0 for value in values):
-                states = ", ".join(outside.plant.states)
+            if len(values) != n or not all(
+                SMALLEST <= value <= (LARGEST if name == "q" else math.inf) for value in values
+            ):
+                states = ", ".join(external.plant.states)
                 raise UserError(f"--{name} = {' '.join(map(str, values))}: must be {n} numbers > 0 ({states})")
-        if not r > 0:
-            raise UserError(f"--r = {r}: must be > 0")
+        if not SMALLEST <= r <= LARGEST:
+            raise UserError(f"--r = {r}: must be > 0 and at most {LARGEST:g}")
         return cls(np.asarray(q), r, np.asarray(limits))
 
 
-def elite_of(outside: Outside, cost: Cost) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+def elite_of(external: ExternalFunnel, cost: Cost) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     """Arrays and record as `elites/NNN` has them; the gains are R^-1 B'S, and the goal's those of the last knot."""
-    inputs = np.append(outside.u, 0.0)
+    inputs = np.append(external.u, 0.0)
     gains = [
-        linear(outside.plant, outside.parameters, x, u)[1] @ s / cost.r
-        for x, u, s in zip(outside.x, inputs, outside.S, strict=True)
+        linear(external.plant, external.parameters, x, u)[1] @ s / cost.r
+        for x, u, s in zip(external.x, inputs, external.S, strict=True)
     ]
-    volumes = outside.volumes
+    volumes = external.volumes
     arrays = {
-        "time": outside.dt * np.arange(len(outside.x)), "x": outside.x, "u": outside.u[:, None],
-        "K": np.array(gains)[:, None], "S": outside.S, "rho": outside.rho,
+        "time": external.dt * np.arange(len(external.x)), "x": external.x, "u": external.u[:, None],
+        "K": np.array(gains)[:, None], "S": external.S, "rho": external.rho,
         "Q": np.diag(cost.q), "R": np.array([[cost.r]]),
-        "K_goal": gains[-1][None], "x_goal": outside.goal, "u_max": np.array([outside.limit]),
+        "K_goal": gains[-1][None], "x_goal": external.goal, "u_max": np.array([external.limit]),
         "volumes_per_knot": volumes, "volumes_sum": volumes.sum(), "volumes_inlet": volumes[0],
-        "volumes_integral": np.trapezoid(volumes, dx=outside.dt),
+        "volumes_integral": np.trapezoid(volumes, dx=external.dt),
+        "volumes_geometric_mean": np.exp(np.mean(np.log(volumes))),
     }  # fmt: skip
     record = {
-        "plant": outside.name,
-        "parameters": outside.parameters,
+        "plant": external.name,
+        "parameters": external.parameters,
         "weights": {"q": cost.q, "r": [cost.r]},
         "state_limits": [limit if math.isfinite(limit) else None for limit in cost.limits.tolist()],
         "status": "OK",
         "rung": CLAIMED,
+        "epsilon": 0.0,
+        "confidence": CONFIDENCE,
+        "volumes": {
+            **{kind: float(arrays[f"volumes_{kind}"]) for kind in ("sum", "integral", "inlet", "geometric_mean")},
+            "share_of_largest_knot": float(volumes.max() / volumes.sum()),
+        },
     }
     return {name: np.asarray(array) for name, array in arrays.items()}, record

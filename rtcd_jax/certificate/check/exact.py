@@ -26,7 +26,11 @@ class Refused(Exception):
     """What is wrong with a certificate, and where."""
 
     def __init__(self, place: str, reason: str):
-        super().__init__(printable(f"{place}: {reason}"))
+        super().__init__(place, reason)  # both, so that it can be sent between processes
+
+    def __str__(self) -> str:
+        place, reason = self.args
+        return printable(f"{place}: {reason}")
 
 
 class Damaged(Refused):

@@ -4,16 +4,14 @@ A proof that is right is not falsified; a prover, a checker and a model that sha
 """
 
 import hashlib
-import time
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple, final
+from typing import NamedTuple
 
 import numpy as np
 
 from rtcd_jax.certificate.falsify.simulation import REPEATED, Motions, Seen
-from rtcd_jax.system.console import Console
+from rtcd_jax.system.console import Clock, Console, Progress
 from rtcd_jax.system.journal import Journal
 from rtcd_jax.system.processes import processes
 
@@ -48,25 +46,6 @@ class Found(NamedTuple):
     def broken(self) -> int:
         """How often the certificate was broken."""
         return self.left_funnel + self.left_limits + self.moved_away + self.not_arrived
-
-
-@final
-@dataclass(frozen=True)
-class Progress:
-    """`done` of `total` motions, `before` of them by an earlier call."""
-
-    done: int
-    total: int
-    level: float
-    elapsed: float
-    before: int
-
-    def __str__(self) -> str:
-        left = self.elapsed * (self.total - self.done) / (self.done - self.before)
-        return (
-            f"{self.done}/{self.total} motions  largest |y| {self.level:.9f}"
-            f"  elapsed {self.elapsed:.0f} s  left {left:.0f} s"
-        )
 
 
 class Part(NamedTuple):
@@ -104,14 +83,15 @@ def falsify_file(path: Path, rollouts: int, seed: int, workers: int, console: Co
     head = {"certificate": digest, "rollouts": rollouts, "seed": seed, "chunk": CHUNK}
     journal = Journal(path.with_name(f".{path.stem}.falsify.jsonl"), head)
     steps = enough_steps(motions, seed)
-    began, kept = time.monotonic(), len(journal.lines)
+    kept = len(journal.lines)
     parts = [Part(**line) for line in journal.lines]
+    clock = Clock(before=sum(part.rollouts for part in parts))
     for part in _parts(path, rollouts, seed, steps, workers, kept):
         journal.append(part._asdict())
         parts.append(part)
-        done, before = sum(each.rollouts for each in parts), sum(each.rollouts for each in parts[:kept])
-        level = max(each.level for each in parts)
-        console.progress(Progress(done, rollouts, level, time.monotonic() - began, before))
+        done, level = sum(each.rollouts for each in parts), max(each.level for each in parts)
+        text = f"{done}/{rollouts} motions  largest |y| {level:.9f}  {clock.times(done, rollouts)}"
+        console.progress(Progress(done, rollouts, text))
     journal.close()
     found = summed(parts, steps)
     console.message(sentence(motions, found))

@@ -13,13 +13,16 @@ from typing import Any, NamedTuple, final
 
 import numpy as np
 from jaxtyping import Bool, Float
+from numpy.linalg import LinAlgError
 
 from rtcd_jax.certificate import check
-from rtcd_jax.certificate.check import Node, Refused
+from rtcd_jax.certificate.check import Node, Refused, Undecided
 from rtcd_jax.elite.simulators import CLOSED_FORMS
 from rtcd_jax.system.errors import UserError
 
 REPEATED = 16
+STEPS = (1e-6, 1e3)
+"""Lengths [s] of a knots' interval that are simulated."""
 ARRIVED = 0.1
 """|y| in the goal region at which a motion is followed no further: the proof holds all the way down."""
 LONGEST = 60.0
@@ -66,7 +69,12 @@ class Motions:
 
     def __init__(self, content: Any):
         claim = check.read_claim(Node("claim", content["claim"]))
+        low, high = STEPS
+        check.insist(
+            low <= float(claim.dt) <= high, "claim.dt", f"cannot be simulated: must be from {low:g} s to {high:g} s"
+        )
         pieces = [check.read_stretch(Node(f"funnel[{i}]", each), claim) for i, each in enumerate(content["funnel"])]
+        check.insist(len(pieces) > 0, "funnel", "has no intervals")
         name = content["claim"]["plant"]
         self.plant, self.n, self.dt, self.limit = name, claim.n, float(claim.dt), float(claim.limit)
         self._rate = CLOSED_FORMS[name]({key: float(value) for key, value in claim.parameters.items()})
@@ -91,7 +99,7 @@ class Motions:
             return cls(check.parse(check.read_bytes(path)))
         except OSError as error:
             raise UserError(f"{path}: {error.strerror}") from None
-        except (Refused, UnicodeDecodeError, KeyError, TypeError) as error:
+        except (Refused, Undecided, KeyError, TypeError, RecursionError, OverflowError, LinAlgError) as error:
             raise UserError(f"{path} is no certificate ({error}): `rtcd check` says more") from None
 
     def follow(self, count: int, steps: int, random: np.random.Generator) -> Seen:

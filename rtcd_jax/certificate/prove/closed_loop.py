@@ -38,7 +38,8 @@ def claim_of(elite: Elite) -> dict[str, Any]:
     The rates of the cubic Hermite interpolant are f(x_k, u_k) and f(x_{k+1}, u_k), rounded to doubles.
 
     Raises:
-        UserError: a plant that the checker does not know, or more than one input.
+        UserError: a plant that the checker does not know, more than one input, knots that are not evenly spaced, or a
+            number that no claim can hold.
     """
     name = elite.plant
     if name not in check.PLANTS:
@@ -46,16 +47,23 @@ def claim_of(elite: Elite) -> dict[str, Any]:
     plant, x, u = check.PLANTS[name], elite.x, elite.u
     if u.shape[1] != 1:
         raise UserError(f"no certificate for {u.shape[1]} inputs: the checker knows loops with one")
-    parameters = {key: float(elite.parameters[key]) for key in plant.parameters}
+    missing = [key for key in plant.parameters if key not in elite.parameters]
+    if missing:
+        raise UserError(f"no certificate without the {name}'s {', '.join(missing)}: its parameters lack them")
+    parameters = {key: np.float64(elite.parameters[key]) for key in plant.parameters}
     if float(elite.u_max[0]) != parameters[plant.limit]:
         raise UserError(f"u_max = {elite.u_max[0]}: must be {plant.limit} = {parameters[plant.limit]}")
+    dt = elite.time[1] - elite.time[0]
+    if not np.allclose(np.diff(elite.time), dt, rtol=1e-9, atol=0):
+        raise UserError("no certificate for knots that are not evenly spaced")
     ends = np.stack([x[:-1], x[1:]])
-    rates = np.moveaxis(rate(plant, parameters, np.moveaxis(ends, 2, 0), u[:, 0]), 0, 2)
-    return {
+    with np.errstate(all="ignore"):  # the checker's reader refuses what is not finite
+        rates = np.moveaxis(rate(plant, parameters, np.moveaxis(ends, 2, 0), u[:, 0]), 0, 2)
+    told = {
         "plant": name,
         "parameters": {key: double(value) for key, value in parameters.items()},
         "state_limits": [double(limit) if np.isfinite(limit) else None for limit in elite.state_limits],
-        "dt": double(elite.time[1] - elite.time[0]),
+        "dt": double(dt),
         "x": doubles(x),
         "rates": doubles(np.swapaxes(rates, 0, 1)),
         "u": doubles(u[:, 0]),
@@ -63,6 +71,11 @@ def claim_of(elite: Elite) -> dict[str, Any]:
         "x_goal": doubles(elite.x_goal),
         "K_goal": doubles(elite.K_goal[0]),
     }
+    try:
+        check.read_claim(check.Node("the elite's claim", sealed({**told, "start": [0, double(0.0)]})))
+    except check.Refused as refused:
+        raise UserError(str(refused)) from None
+    return told
 
 
 def rate(plant: check.Plant, parameters: Mapping[str, float], x: np.ndarray, u: Any) -> np.ndarray:

@@ -1,26 +1,20 @@
 """`rtcd certify`: elites of a run folder in parallel processes, one line of progress, a table at the end."""
 
 import contextlib
-import io
 import os
 import queue
-import time
 from collections.abc import Iterator, Sequence
 from concurrent.futures import Future
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, final
+from typing import Any
 
-from rich.box import SIMPLE
-from rich.console import Console as Terminal
-from rich.table import Table
 from scipy.stats import spearmanr
 
 from rtcd_jax.certificate.prove.certify import Outcome, Step, certify_elite
 from rtcd_jax.certificate.prove.closed_loop import claim_of
 from rtcd_jax.elite.elite import Elite
 from rtcd_jax.elite.records import require_elites
-from rtcd_jax.system.console import Console
+from rtcd_jax.system.console import Clock, Console, Progress, table
 from rtcd_jax.system.files import make_folder, read_json, replace_json
 from rtcd_jax.system.processes import CONTEXT, processes
 
@@ -28,25 +22,6 @@ POLL = 0.2
 """Seconds between looks at the workers' progress."""
 RANKED = 3
 """Elites from which on a rank correlation says something."""
-
-
-@final
-@dataclass(frozen=True)
-class Progress:
-    """All elites' certificates together, `done` of `total` thousandths of them."""
-
-    done: int
-    total: int
-    step: Step
-    elapsed: float
-
-    def __str__(self) -> str:
-        step, share = self.step, self.done / self.total
-        left = self.elapsed * (1 - share) / share if share else float("nan")
-        return (
-            f"elite {step.elite}  interval {step.knot + 1}/{step.knots}  back to t = {step.time:.3f} s"
-            f"  rho {step.rho:.4g}  margin {step.margin:.2g}/s  elapsed {self.elapsed:.0f} s  left {left:.0f} s"
-        )
 
 
 def certify_run(
@@ -68,12 +43,13 @@ def certify_run(
     summary = target / "summary.json"
     former = read_json(summary, "remove it, or make it again") if summary.is_file() else {}
     outcomes: dict[str, Outcome | None] = {}
-    began, reached = time.monotonic(), dict.fromkeys(names, 0.0)
+    clock, reached = Clock(), dict.fromkeys(names, 0.0)
     for event in _events(folder, names, rung, workers, optimize_value):
         if isinstance(event, Step):
             reached[event.elite] = 1 - event.knot / event.knots
-            done = round(1000 * sum(reached.values()) / len(reached))
-            console.progress(Progress(done, 1000, event, time.monotonic() - began))
+            done = sum(reached.values())
+            text = f"{_sentence(event)}  {clock.times(done, len(names))}"
+            console.progress(Progress(done, len(names), text))
         else:
             outcomes[event[0]] = event[1]
     replace_json(summary, former | {name: _summary(outcomes[name]) for name in names})
@@ -132,25 +108,29 @@ def _summary(outcome: Outcome | None) -> dict[str, Any] | None:
     return None if outcome is None else outcome._asdict()
 
 
+def _sentence(step: Step) -> str:
+    return (
+        f"elite {step.elite}  interval {step.knot + 1}/{step.knots}  back to t = {step.time:.3f} s"
+        f"  rho {step.rho:.4g}  margin {step.margin:.2g}/s"
+    )
+
+
 def _table(outcomes: Sequence[Outcome], title: str) -> str:
-    table = Table(box=SIMPLE, title=title)
-    table.add_column("elite")
-    for heading in ("from, s", "intervals", "took, s", "inlet", "sum", "ratio of sums", "integral", "goal"):
-        table.add_column(heading, justify="right")
-    for outcome in outcomes:
-        pairs = {key: f"{value:.4g} / {outcome.found[key]:.4g}" for key, value in outcome.sampled.items()}
-        sampled = outcome.sampled["sum"]
-        table.add_row(
-            outcome.elite,
-            f"{outcome.start:.4g}",
-            f"{outcome.intervals}",
-            f"{outcome.seconds:.1f}",
-            pairs["inlet"],
-            pairs["sum"],
-            f"{outcome.found['sum'] / sampled:.4f}" if sampled else "none",
-            pairs["integral"],
-            pairs["goal"],
-        )
-    text = io.StringIO()
-    Terminal(file=text, width=150).print(table)
-    return text.getvalue().rstrip()
+    headings = ("elite", "from, s", "intervals", "took, s", "inlet", "sum", "ratio of sums", "integral", "goal")
+    return table(headings, map(_row, outcomes), title, left={"elite"})
+
+
+def _row(outcome: Outcome) -> list[str]:
+    pairs = {key: f"{value:.4g} / {outcome.found[key]:.4g}" for key, value in outcome.sampled.items()}
+    sampled = outcome.sampled["sum"]
+    return [
+        outcome.elite,
+        f"{outcome.start:.4g}",
+        f"{outcome.intervals}",
+        f"{outcome.seconds:.1f}",
+        pairs["inlet"],
+        pairs["sum"],
+        f"{outcome.found['sum'] / sampled:.4f}" if sampled else "none",
+        pairs["integral"],
+        pairs["goal"],
+    ]

@@ -1,6 +1,7 @@
 """The videos move, show both candidates, and are refused by one line where nothing can draw."""
 
 import os
+import re
 import subprocess
 import sys
 
@@ -72,6 +73,21 @@ def test_without_an_initial_funnel_the_best_is_shown_alone(tmp_path, backend):
         assert gif.size == (animate.SIDE // 2, animate.SIDE + animate.GAP // 2)
 
 
+def test_progress_is_drawn_on_a_terminal(tmp_path, backend):
+    """Three frames a second of a short motion, in a process of its own."""
+    code = (
+        "import sys\nfrom pathlib import Path\nfrom rtcd_jax.system.devices import prepare_jax\nprepare_jax()\n"
+        "from rtcd_jax.analysis.animate import animate\nfrom tests.consoles import Screen\n"
+        "animate.RATE, animate.HOLD, animate.SIDE = 3, 0.0, 60\nscreen = Screen()\n"
+        "with screen.console as console:\n    animate.animate_run(Path(sys.argv[1]), None, 0, console)\n"
+        "print(screen.text)"
+    )
+    command = [sys.executable, "-c", code, str(loop_folder(tmp_path / "run", "pendulum"))]
+    done = subprocess.run(command, cwd=ROOT, env=os.environ | {"MUJOCO_GL": backend}, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert re.search(r"frame (\d+) of \1  elapsed 0:\d\d  left 0:00", done.stdout)
+
+
 def test_where_nothing_draws_it_is_told_in_one_line(tmp_path):
     done = rtcd("animate", loop_folder(tmp_path / "run", "pendulum"), MUJOCO_GL="glfw", DISPLAY="")
     assert done.returncode == 2
@@ -111,7 +127,8 @@ def test_without_any_ffmpeg_there_is_none(monkeypatch):
 
 
 def test_the_ways_of_drawing_are_tried_in_turn(monkeypatch):
-    monkeypatch.delenv("MUJOCO_GL", raising=False)
+    monkeypatch.setenv("MUJOCO_GL", "none")  # so that what the choice leaves there goes with this test
+    monkeypatch.delenv("MUJOCO_GL")
     tried = []
 
     def run(_, env, **__):

@@ -9,29 +9,17 @@ import pytest
 from rtcd_jax.analysis import disturb
 from rtcd_jax.analysis.disturb import comparison as contests
 from rtcd_jax.analysis.disturb import disturb_run, experiments
-from rtcd_jax.analysis.disturb.comparison import Progress, motions, read_contest, run
+from rtcd_jax.analysis.disturb.comparison import Meter, motions, read_contest, run
 from rtcd_jax.analysis.disturb.experiments import SCORED
 from rtcd_jax.analysis.disturb.scenarios import undisturbed
 from rtcd_jax.elite.closed_loop import runge_kutta, simulate
 from rtcd_jax.elite.records import read_elite, write_elite
 from rtcd_jax.elite.simulators import simulators_of
 from rtcd_jax.system.errors import UserError
+from tests.consoles import Screen
 from tests.export.folders import run_folder
 
 NAMES = ("off_nominal", "impulse", "robustness")
-
-
-class Remembering:
-    """A console that keeps what it is told."""
-
-    def __init__(self):
-        self.lines, self.progressed = [], []
-
-    def message(self, text):
-        self.lines.append(text)
-
-    def progress(self, now):
-        self.progressed.append(now)
 
 
 class NoMeter:
@@ -44,7 +32,7 @@ class NoMeter:
 SMALL = {
     experiments: {"FACTORS": (1, 4), "TIMES": 5, "SIZES": 7, "LEVELS": 5, "REPEATS": 2, "PROFILES": 6},
     disturb: {"FACTORS": (1, 4), "TIMES": 5, "SIZES": 7},
-    contests: {"BATCH": 256},
+    contests: {"BATCH": 256, "REPORTED": 0.0},
 }
 
 
@@ -62,13 +50,13 @@ def small():
 def disturbed(small, tmp_path_factory):
     """A disturbed run folder, what it said, and the bytes of its records."""
     folder = run_folder(tmp_path_factory.mktemp("disturbed") / "run", "pendulum")
-    console = Remembering()
-    disturb_run(folder, 30, 5, console)
-    return folder, console, {name: (folder / "disturbance" / f"{name}.json").read_bytes() for name in NAMES}
+    screen = Screen()
+    disturb_run(folder, 30, 5, screen.console)
+    return folder, screen.text, {name: (folder / "disturbance" / f"{name}.json").read_bytes() for name in NAMES}
 
 
 def test_every_experiment_leaves_its_record_and_its_figures(disturbed):
-    folder, console, records = disturbed
+    folder, text, records = disturbed
     for name, content in records.items():
         record = json.loads(content)
         assert record["plant"] == "pendulum"
@@ -79,15 +67,21 @@ def test_every_experiment_leaves_its_record_and_its_figures(disturbed):
     robust = json.loads(records["robustness"])["summary"]
     for criteria in robust.values():
         assert criteria["score"] == pytest.approx(np.mean([criteria[name] for name in SCORED]))
-    text = "\n".join(console.lines)
-    for words in ("best ellipsoid x 1", "recovered", "score", "control rate", "3 records and 6 figures"):
+    for words in (
+        "robustness   100%  elapsed",
+        "best ellipsoid x 1",
+        "recovered",
+        "score",
+        "control rate",
+        "3 records and 6 figures",
+    ):
         assert words in text
 
 
 def test_the_same_seed_gives_the_same_records_and_another_one_others(disturbed, tmp_path):
     folder, _, records = disturbed
     copy = shutil.copytree(folder, tmp_path / "copy")
-    disturb_run(copy, 30, 5, Remembering())
+    disturb_run(copy, 30, 5, Screen().console)
     for name, content in records.items():
         assert (copy / "disturbance" / f"{name}.json").read_bytes() == content
     read = json.loads(records["off_nominal"])
@@ -99,7 +93,7 @@ def test_the_same_seed_gives_the_same_records_and_another_one_others(disturbed, 
 def test_verdicts_are_the_verifications(tmp_path):
     """Uniform states of the first ellipsoid, and others twelve times as far: arrived or not, state by state."""
     folder = run_folder(tmp_path / "run", "pendulum")
-    contest = read_contest(folder, Remembering())
+    contest = read_contest(folder, Screen().console)
     elite = contest.elites[1]
     x = elite.points(np.zeros(60, int), np.random.default_rng(0))
     x[::2] = elite.x[0] + 3 * (x[::2] - elite.x[0])
@@ -135,17 +129,23 @@ def test_an_initial_candidate_without_a_funnel_is_left_out(tmp_path):
     folder = run_folder(tmp_path / "run", "pendulum")
     arrays, record = read_elite(folder, "initial")
     write_elite(folder, "initial", arrays, record | {"status": "FUNNEL_EMPTY"})
-    console = Remembering()
-    assert read_contest(folder, console).names == ("best",)
-    assert console.lines == ["the initial candidate has no funnel (FUNNEL_EMPTY): the best elite is disturbed alone"]
+    screen = Screen()
+    assert read_contest(folder, screen.console).names == ("best",)
+    assert screen.text == "the initial candidate has no funnel (FUNNEL_EMPTY): the best elite is disturbed alone\n"
 
 
 def test_a_run_without_elites_is_refused(tmp_path):
     (tmp_path / "format.json").touch()
     with pytest.raises(UserError, match="has no elites yet: finish the run first"):
-        disturb_run(tmp_path, 10, 0, Remembering())
+        disturb_run(tmp_path, 10, 0, Screen().console)
 
 
-def test_progress_says_what_is_left():
-    assert str(Progress(250, 1000, "impulse", 10.0)) == "impulse       25%  elapsed 10 s  left 30 s"
-    assert "left" not in str(Progress(5, 1000, "impulse", 10.0))
+def test_progress_on_a_terminal_says_what_is_left(monkeypatch):
+    monkeypatch.setattr(contests, "REPORTED", 0.0)
+    screen = Screen()
+    with screen.console as console:
+        meter = Meter(console, 1000)
+        meter.tick("impulse", 5)
+        meter.tick("impulse", 245)
+    assert "impulse        0%  elapsed 0:00  left unknown" in screen.text
+    assert "impulse       25%  elapsed 0:00  left 0:00" in screen.text

@@ -75,7 +75,7 @@ def test_colors_tell_the_same_time_in_both_columns(tmp_path, figures):
 @pytest.mark.parametrize(
     ("limits", "visible"),
     [
-        ([1.0, 0.01], {(1.0, 0), (0, 0.01), (0, -0.01)}),
+        ([1.2, 0.01], {(1.2, 0), (0, 0.01), (0, -0.01)}),
         ([float("inf"), 0.01], {(0, 0.01), (0, -0.01)}),
         ([100.0, 100.0], set()),
     ],

@@ -10,17 +10,7 @@ import pytest
 from rtcd_jax.analysis.scale.study import OUT_OF_MEMORY, efficiencies, row_of, study
 from rtcd_jax.cli import main as cli
 from rtcd_jax.config.load import EXAMPLE, parse_yaml
-
-
-class Listener:
-    def __init__(self):
-        self.text = ""
-
-    def message(self, text):
-        self.text += f"{text}\n"
-
-    def progress(self, now):
-        self.message(str(now))
+from tests.consoles import Screen
 
 
 def point(population, devices, seconds):
@@ -79,12 +69,12 @@ def test_efficiency_is_one_where_the_rate_grows_with_the_devices():
 def test_a_study_leaves_points_table_and_figures_and_goes_on_where_it_stopped(tmp_path, monkeypatch):
     config = parse_yaml(EXAMPLE)
     asked = answering(monkeypatch, measured)
-    study(tmp_path / "x.yaml", config, (64, 32), (1,), 3, tmp_path / "study", Listener())
+    study(tmp_path / "x.yaml", config, (64, 32), (1,), 3, tmp_path / "study", Screen().console)
     assert asked == [(32, 1), (64, 1)]
-    console = Listener()
-    study(tmp_path / "x.yaml", config, (64, 32), (1, 2), 3, tmp_path / "study", console)
+    screen = Screen()
+    study(tmp_path / "x.yaml", config, (64, 32), (1, 2), 3, tmp_path / "study", screen.console)
     assert asked[2:] == [(32, 2), (64, 2)]
-    assert "point 4/4: population 64, 2 devices: 200 candidates/s" in console.text
+    assert "point 4/4: population 64, 2 devices: 200 candidates/s" in screen.text
     with (tmp_path / "study" / "table.csv").open() as file:
         rows = list(csv.DictReader(file))
     assert [(row["population"], row["devices"]) for row in rows] == [("32", "1"), ("32", "2"), ("64", "1"), ("64", "2")]
@@ -92,7 +82,7 @@ def test_a_study_leaves_points_table_and_figures_and_goes_on_where_it_stopped(tm
     for suffix in ("png", "pdf"):
         assert (tmp_path / "study" / f"scaling.{suffix}").stat().st_size > 10_000
     other = config.model_copy(update={"search": config.search.model_copy(update={"sigma": 0.2})})
-    study(tmp_path / "x.yaml", other, (32,), (1,), 3, tmp_path / "study", Listener())
+    study(tmp_path / "x.yaml", other, (32,), (1,), 3, tmp_path / "study", Screen().console)
     assert asked[4:] == [(32, 1)]
 
 
@@ -110,10 +100,10 @@ def test_a_study_leaves_points_table_and_figures_and_goes_on_where_it_stopped(tm
 def test_a_point_that_fails_says_why_the_others_go_on_and_it_is_tried_again(tmp_path, monkeypatch, failure, why):
     asked = answering(monkeypatch, lambda population, devices: failure if population > 32 else measured(32, devices))
     for _ in range(2):
-        console = Listener()
-        study(tmp_path / "x.yaml", parse_yaml(EXAMPLE), (32, 64), (1,), 3, tmp_path, console)
-        assert f"population 64, 1 devices: {why}" in console.text
-        assert "population 32, 1 devices: 100 candidates/s" in console.text
+        screen = Screen()
+        study(tmp_path / "x.yaml", parse_yaml(EXAMPLE), (32, 64), (1,), 3, tmp_path, screen.console)
+        assert f"population 64, 1 devices: {why}" in screen.text
+        assert "population 32, 1 devices: 100 candidates/s" in screen.text
     assert asked == [(32, 1), (64, 1), (64, 1)]
     with (tmp_path / "table.csv").open() as file:
         assert [bool(row["failed"]) for row in csv.DictReader(file)] == [False, True]
@@ -121,7 +111,7 @@ def test_a_point_that_fails_says_why_the_others_go_on_and_it_is_tried_again(tmp_
 
 def test_nothing_but_failures_is_no_crash(tmp_path, monkeypatch):
     answering(monkeypatch, lambda population, devices: {"returncode": -9})
-    study(tmp_path / "x.yaml", parse_yaml(EXAMPLE), (32,), (1,), 3, tmp_path, Listener())
+    study(tmp_path / "x.yaml", parse_yaml(EXAMPLE), (32,), (1,), 3, tmp_path, Screen().console)
     assert (tmp_path / "table.csv").read_text() == "population,devices,failed\n32,1,out of memory\n"
 
 

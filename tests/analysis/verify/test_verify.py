@@ -21,6 +21,7 @@ from rtcd_jax.elite.records import write_elite
 from rtcd_jax.elite.simulators import simulators_of
 from rtcd_jax.plants.mjx import model_of
 from rtcd_jax.system.errors import UserError
+from tests.consoles import Screen, Stopped
 
 PARAMETERS = {"m": 0.7, "l": 0.4, "b": 0.1, "g": 9.81, "torque_limit": 2.5}
 INERTIA = PARAMETERS["m"] * PARAMETERS["l"] ** 2
@@ -244,17 +245,6 @@ def test_a_promise_is_broken_only_beyond_its_confidence():
     assert not dataclasses.replace(result, epsilon=0.999 * lower).keeps("closed form")
 
 
-class _Listener:
-    def __init__(self):
-        self.text = ""
-
-    def message(self, text: str) -> None:
-        self.text += text + "\n"
-
-    def progress(self, now) -> None:
-        self.message(str(now))
-
-
 def _store(folder, name: str, elite: Elite, **changes) -> None:
     record = {key: getattr(elite, key) for key in ("plant", "parameters", "epsilon", "confidence")}
     limits = [limit if np.isfinite(limit) else None for limit in elite.state_limits]
@@ -272,8 +262,8 @@ def test_verify_run_stores_what_it_found_and_tells_it(tmp_path):
     limited = dataclasses.replace(_held(HELD), state_limits=np.array([np.inf, 7.0]))
     _store(tmp_path / "elites", "000", limited)
     _store(tmp_path, "initial", _held(100 * HELD))
-    console = _Listener()
-    assert not verify_run(tmp_path, 60, 3, 1, console)
+    screen = Screen()
+    assert not verify_run(tmp_path, 60, 3, 1, screen.console)
     kept, broken = (json.loads((tmp_path / "verification" / f"{name}.json").read_text()) for name in ("000", "initial"))
     assert (kept["kept"], broken["kept"]) == (True, False)
     for record in (kept, broken):
@@ -282,7 +272,7 @@ def test_verify_run_stores_what_it_found_and_tells_it(tmp_path):
             assert sum(found["failures_per_knot"]) == found["failures"]
             assert found["rate_lower"] <= found["rate"] == found["failures"] / 60 <= found["rate_upper"]
     assert broken["witnesses"]["closed form"]["failures"] > 0
-    rows = [line.split() for line in console.text.splitlines()]
+    rows = [line.split() for line in screen.text.splitlines()]
     verdicts = [(row[0], row[-1]) for row in rows if row and row[0] in ("000", "initial")]
     assert verdicts == [("000", "kept"), ("000", "kept"), ("initial", "BROKEN"), ("initial", "BROKEN")]
 
@@ -290,9 +280,9 @@ def test_verify_run_stores_what_it_found_and_tells_it(tmp_path):
 def test_verify_run_reports_an_initial_candidate_without_a_funnel(tmp_path):
     _store(tmp_path / "elites", "000", _held(HELD))
     _store(tmp_path, "initial", _held(HELD), status="FUNNEL_EMPTY")
-    console = _Listener()
-    assert verify_run(tmp_path, 60, 0, 1, console)
-    assert "initial: nothing to verify, it has no funnel (FUNNEL_EMPTY)" in console.text
+    screen = Screen()
+    assert verify_run(tmp_path, 60, 0, 1, screen.console)
+    assert "initial: nothing to verify, it has no funnel (FUNNEL_EMPTY)" in screen.text
     assert not (tmp_path / "verification" / "initial.json").exists()
 
 
@@ -312,30 +302,25 @@ def test_a_stopped_verification_goes_on_and_ends_with_the_same_files(tmp_path, m
     for name in ("whole", "stopped"):
         _store(tmp_path / name / "elites", "000", _held(10 * HELD))
         _store(tmp_path / name, "initial", _held(HELD))
-    verify_run(tmp_path / "whole", 60, 3, 1, _Listener())
-
-    class Stopping(_Listener):
-        def progress(self, now) -> None:
-            if now.done == 5:
-                raise KeyboardInterrupt
+    verify_run(tmp_path / "whole", 60, 3, 1, Screen().console)
 
     folder = tmp_path / "stopped"
-    with pytest.raises(KeyboardInterrupt):
-        verify_run(folder, 60, 3, 1, Stopping())
-    console = _Listener()
-    verify_run(folder, 60, 3, 1, console)
-    assert "6/12 chunks" in console.text
-    assert "5/12 chunks" not in console.text
+    with pytest.raises(Stopped):
+        verify_run(folder, 60, 3, 1, Screen(stop="5/12 chunks").console)
+    screen = Screen()
+    verify_run(folder, 60, 3, 1, screen.console)
+    assert "6/12 chunks" in screen.text
+    assert "5/12 chunks" not in screen.text
     for name in ("000.json", "initial.json"):
         whole, stopped = (tmp_path / run / "verification" / name for run in ("whole", "stopped"))
         assert whole.read_bytes() == stopped.read_bytes()
     assert sorted(path.name for path in (folder / "verification").iterdir()) == ["000.json", "initial.json"]
-    with pytest.raises(KeyboardInterrupt):
-        verify_run(folder, 60, 3, 1, Stopping())
+    with pytest.raises(Stopped):
+        verify_run(folder, 60, 3, 1, Screen(stop="5/12 chunks").console)
     _store(folder, "initial", _held(0.9 * HELD))
-    console = _Listener()
-    verify_run(folder, 60, 3, 1, console)
-    assert "6/12 chunks" in console.text
+    screen = Screen()
+    verify_run(folder, 60, 3, 1, screen.console)
+    assert "6/12 chunks" in screen.text
 
 
 def test_the_number_of_processes_changes_nothing(tmp_path):
@@ -343,7 +328,7 @@ def test_the_number_of_processes_changes_nothing(tmp_path):
     _store(tmp_path, "initial", _held(HELD))
     found = []
     for workers in (1, 2):
-        verify_run(tmp_path, 60, 3, workers, _Listener())
+        verify_run(tmp_path, 60, 3, workers, Screen().console)
         found.append([path.read_bytes() for path in sorted((tmp_path / "verification").iterdir())])
     assert found[0] == found[1]
 
@@ -356,13 +341,13 @@ def test_the_same_seed_gives_the_same_states():
 
 def test_verify_run_refuses_what_is_no_finished_run(tmp_path):
     with pytest.raises(UserError, match=r"nowhere is no run folder: it has no format\.json"):
-        verify_run(tmp_path / "nowhere", 60, 0, 1, _Listener())
+        verify_run(tmp_path / "nowhere", 60, 0, 1, Screen().console)
     (tmp_path / "format.json").touch()
     with pytest.raises(UserError, match="has no elites yet: finish the run first"):
-        verify_run(tmp_path, 60, 0, 1, _Listener())
+        verify_run(tmp_path, 60, 0, 1, Screen().console)
     _store(tmp_path / "elites", "000", _held(HELD))
     with pytest.raises(UserError, match=r"has no initial\.npz"):
-        verify_run(tmp_path, 60, 0, 1, _Listener())
+        verify_run(tmp_path, 60, 0, 1, Screen().console)
 
 
 def test_too_few_states_for_the_knots_are_refused():

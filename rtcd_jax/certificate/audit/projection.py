@@ -1,4 +1,4 @@
-"""A motion that is no solution of the dynamics, mended: the nearest one that is, and its own TVLQR.
+"""A motion that is no solution of the dynamics, projected onto them: the nearest one that is, and its own TVLQR.
 
     minimize  sum |u - u_given|^2 / F^2 + sum |(x - x_given) / scale|^2
     such that x_{k+1} = Phi(x_k, u_k),  x_0 and x_N the given ends,  |u| <= F,  |x| <= the limits,
@@ -17,7 +17,7 @@ import scipy.sparse as sp
 from scipy.integrate import solve_ivp
 from scipy.linalg import solve_continuous_are
 
-from rtcd_jax.certificate.audit.external import Cost, Outside
+from rtcd_jax.certificate.audit.external import Cost, ExternalFunnel
 from rtcd_jax.certificate.prove.closed_loop import linear, rate
 from rtcd_jax.elite.closed_loop import runge_kutta_step
 from rtcd_jax.elite.funnel import riccati_rate
@@ -26,11 +26,11 @@ from rtcd_jax.system.errors import UserError
 
 SUBSTEPS = 20
 """Runge-Kutta steps of Phi."""
-MENDED = 1e-11
-"""Largest defect [state units] of a mended motion."""
+EXACT = 1e-11
+"""Largest defect [state units] of a projected motion."""
 ROUNDS = 100
 INSIDE = 0.999
-"""Share of the limits that a mended motion may use."""
+"""Share of the limits that a projected motion may use."""
 SMALLEST = 1e-3
 """Smallest scale of a state, for one that hardly moves."""
 
@@ -43,62 +43,81 @@ class Flow(NamedTuple):
     by_input: np.ndarray
 
 
-def flow(outside: Outside, x: np.ndarray, u: np.ndarray) -> Flow:
+def flow(external: ExternalFunnel, x: np.ndarray, u: np.ndarray) -> Flow:
     """Phi from the states x [N n] under the inputs u [N], with derivatives by complex steps."""
     n, step = x.shape[1], 1e-30
     seeds = np.concatenate([1j * step * np.eye(n + 1), np.zeros((1, n + 1))])
     state = x.T[:, :, None] + seeds.T[:n, None, :]
     held = u[:, None] + seeds.T[n, None, :]
-    h = outside.dt / SUBSTEPS
+    h = external.dt / SUBSTEPS
     for _ in range(SUBSTEPS):
-        state = runge_kutta_step(lambda _, x: rate(outside.plant, outside.parameters, x, held), state, h)
+        state = runge_kutta_step(lambda _, x: rate(external.plant, external.parameters, x, held), state, h)
     slopes = np.imag(state[:, :, :-1]) / step
     return Flow(np.real(state[:, :, -1]).T, np.moveaxis(slopes[:, :, :n], 0, 1), slopes[:, :, n].T)
 
 
-def defects(outside: Outside) -> np.ndarray:
+def defects(external: ExternalFunnel) -> np.ndarray:
     """x_{k+1} - Phi(x_k, u_k) [N n] of the given motion."""
-    return outside.x[1:] - flow(outside, outside.x[:-1], outside.u).end
+    return external.x[1:] - flow(external, external.x[:-1], external.u).end
 
 
-def repaired(outside: Outside, cost: Cost) -> Outside:
+def with_fitting_inputs(external: ExternalFunnel) -> tuple[ExternalFunnel, dict[str, float]]:
+    """The motion under the file's inputs as written (row k until knot k+1) or moved by one knot, whichever fits it.
+
+    Beside it the misfit of both: the largest defect in shares of the states' largest values. Moved are inputs whose row
+    k holds until knot k, as some tools write them; they are taken only where they fit twice as well.
+    """
+    rows = {"as written": external.inputs[:-1], "moved by one knot": external.inputs[1:]}
+    scale = np.maximum(np.max(np.abs(external.x), axis=0), SMALLEST)
+    misfits = {
+        name: float(np.max(np.abs(defects(external._replace(u=u))) / scale))
+        for name, u in rows.items()
+        if np.all(np.isfinite(u))
+    }
+    name = min(misfits, key=lambda name: misfits[name] * (2 if name == "moved by one knot" else 1))
+    return external._replace(u=rows[name]), misfits
+
+
+def projected(external: ExternalFunnel, cost: Cost) -> ExternalFunnel:
     """The nearest motion that solves the dynamics, with S of its own TVLQR and levels that keep the volumes.
 
     Raises:
         UserError: none was found.
     """
-    x, u = outside.x.copy(), outside.u.copy()
-    x[-1] = outside.goal
+    x, u = external.x.copy(), external.u.copy()
+    x[-1] = external.goal
     for _ in range(ROUNDS):
-        now = flow(outside, x[:-1], u)
-        if np.max(np.abs(x[1:] - now.end)) < MENDED and np.max(np.abs(u)) <= outside.limit:
-            mended = outside._replace(x=x, u=u)
-            values = tracking_values(mended, cost)
-            return mended._replace(S=values, rho=_levels(outside, values))
-        x, u = _nearest(outside, x, u, now, cost.limits)
+        now = flow(external, x[:-1], u)
+        if not np.all(np.isfinite(now.by_state)):
+            raise UserError("the motion leaves all numbers within one interval: are the units those of the plant?")
+        if np.max(np.abs(x[1:] - now.end)) < EXACT and np.max(np.abs(u)) <= external.limit:
+            moved = external._replace(x=x, u=u)
+            values = tracking_values(moved, cost)
+            return moved._replace(S=values, rho=_levels(external, values))
+        x, u = _nearest(external, x, u, now, cost.limits)
     raise UserError("no motion near the given one solves the dynamics between its ends and within the limits")
 
 
-def _levels(outside: Outside, values: np.ndarray) -> np.ndarray:
+def _levels(external: ExternalFunnel, values: np.ndarray) -> np.ndarray:
     """With which the ellipsoids of other shapes have the given volumes."""
-    n = len(outside.goal)
-    return outside.rho * (np.linalg.det(values) / np.linalg.det(outside.S)) ** (1 / n)
+    n = len(external.goal)
+    return external.rho * (np.linalg.det(values) / np.linalg.det(external.S)) ** (1 / n)
 
 
 def _nearest(
-    outside: Outside, x: np.ndarray, u: np.ndarray, now: Flow, limits: np.ndarray
+    external: ExternalFunnel, x: np.ndarray, u: np.ndarray, now: Flow, limits: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """One quadratic program for all knots and inputs, Phi linearized about x [N+1 n] and u [N]."""
     import clarabel
 
     rows, offset = _linearized(x, u, now)
     knots, n = x.shape
-    scale = np.maximum(np.max(np.abs(outside.x), axis=0), SMALLEST)
-    weights = np.concatenate([np.tile(scale**-2, knots), np.full(len(u), outside.limit**-2)])
-    given = np.concatenate([outside.x.ravel(), outside.u])
+    scale = np.maximum(np.max(np.abs(external.x), axis=0), SMALLEST)
+    weights = np.concatenate([np.tile(scale**-2, knots), np.full(len(u), external.limit**-2)])
+    given = np.concatenate([external.x.ravel(), external.u])
     room = np.full_like(x, np.inf)
     room[1:-1] = INSIDE * limits
-    bounds = np.concatenate([room.ravel(), np.full(len(u), INSIDE * outside.limit)])
+    bounds = np.concatenate([room.ravel(), np.full(len(u), INSIDE * external.limit)])
     bounded = sp.identity(len(bounds), format="csr")[np.isfinite(bounds)]
     finite = bounds[np.isfinite(bounds)]
     settings = clarabel.DefaultSettings()
@@ -132,20 +151,20 @@ def _linearized(x: np.ndarray, u: np.ndarray, now: Flow) -> tuple[Any, np.ndarra
     return rows, np.concatenate([right.ravel(), x[0], x[-1]])
 
 
-def tracking_values(outside: Outside, cost: Cost) -> np.ndarray:
+def tracking_values(external: ExternalFunnel, cost: Cost) -> np.ndarray:
     """S [N+1 n n] of the time-varying LQR along the motion, backward from the goal's own."""
-    plant, parameters = outside.plant, outside.parameters
-    (a, b), q, r, n = linear(plant, parameters, outside.goal, 0.0), np.diag(cost.q), cost.r, len(outside.goal)
+    plant, parameters = external.plant, external.parameters
+    (a, b), q, r, n = linear(plant, parameters, external.goal, 0.0), np.diag(cost.q), cost.r, len(external.goal)
     values = [solve_continuous_are(a, b[:, None], q, [[r]])]
-    for k in range(len(outside.u) - 1, -1, -1):
-        ends, u = outside.x[k : k + 2], outside.u[k]
+    for k in range(len(external.u) - 1, -1, -1):
+        ends, u = external.x[k : k + 2], external.u[k]
         rates = [rate(plant, parameters, x, u) for x in ends]
 
         def backward(t: float, flat: np.ndarray, ends=ends, u=u, rates=rates) -> np.ndarray:
-            x = cubic_hermite(1 - t / outside.dt, outside.dt, ends[0], rates[0], ends[1], rates[1])
+            x = cubic_hermite(1 - t / external.dt, external.dt, ends[0], rates[0], ends[1], rates[1])
             a, b = linear(plant, parameters, x, u)
             return -riccati_rate(flat.reshape(n, n), a, b[:, None], q, np.array([r])).ravel()
 
-        found = solve_ivp(backward, (0, outside.dt), values[0].ravel(), method="LSODA", rtol=1e-9, atol=1e-9)
+        found = solve_ivp(backward, (0, external.dt), values[0].ravel(), method="LSODA", rtol=1e-9, atol=1e-9)
         values.insert(0, found.y[:, -1].reshape(n, n))
     return np.array([(s + s.T) / 2 for s in values])
