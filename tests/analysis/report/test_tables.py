@@ -1,4 +1,4 @@
-"""The tables' numbers are the run's, each beside its rung."""
+"""The tables' numbers are the run's, each beside its guarantee."""
 
 import json
 import math
@@ -26,19 +26,19 @@ def rows(table):
     return [dict(zip(table.heads, row, strict=True)) for row in table.rows]
 
 
-def test_table_one_has_initial_optimal_ratio_and_time_with_every_number_s_rung(tmp_path):
+def test_table_one_has_initial_optimal_ratio_and_time_with_every_number_s_guarantee(tmp_path):
     folder = finished(tmp_path / "run")
     (folder / "provenance.json").write_text(json.dumps({"starts": [{"seconds": 133.0}]}))
     first, *others = rows(tables.gains([proved(folder)]))
     assert first == {
         "volume": "sum (searched)", "unit": "rad²/s", "initial": 111.0, "optimal": 333.0, "ratio": 3.0,
-        "time": "2 min 13 s", "rung": "sampled",
+        "time": "2 min 13 s", "guarantee": "sampled",
     }  # fmt: skip
     assert [row["volume"] for row in others] == [
-        "integral", "inlet", "geometric mean", "sum", "integral", "inlet",
+        "integral", "initial ellipsoid", "geometric mean", "sum", "integral", "initial ellipsoid",
     ]  # fmt: skip
     shown = others[3]
-    assert (shown["optimal"], shown["rung"], shown["time"]) == (330.0, "proved", "7.25 s")
+    assert (shown["optimal"], shown["guarantee"], shown["time"]) == (330.0, "proved", "7.25 s")
     assert shown["initial"] is shown["ratio"] is None
 
 
@@ -49,7 +49,7 @@ def test_without_an_initial_funnel_there_is_no_ratio(tmp_path):
     assert rows(tables.elites(run))[0]["sum × initial"] is None
 
 
-def test_elites_are_told_with_designs_weights_volumes_and_rung(tmp_path):
+def test_elites_are_told_with_designs_weights_volumes_and_guarantee(tmp_path):
     config = experiment()
     folder = run_folder(
         tmp_path / "run", config, candidate(config), [candidate(config, 1, 3.0), candidate(config, 2, 2.0)]
@@ -59,10 +59,10 @@ def test_elites_are_told_with_designs_weights_volumes_and_rung(tmp_path):
     assert (first["mass [kg]"], first["q1"], first["q2"], first["r1"]) == (0.7, 10, 1, 0.1)
     assert (first["sum [rad²/s]"], second["sum [rad²/s]"]) == (333, 222)
     assert (first["sum × initial"], second["sum × initial"]) == (3, 2)
-    assert {row["rung"] for row in (first, second)} == {"sampled"}
+    assert {row["guarantee"] for row in (first, second)} == {"sampled"}
     assert "sum shown" not in first
     first, second = rows(tables.elites(proved(folder)))
-    assert (first["sum shown"], first["rung shown"], second["sum shown"]) == (330.0, "proved", None)
+    assert (first["sum shown"], first["guarantee shown"], second["sum shown"]) == (330.0, "proved", None)
 
 
 def test_certificates_stand_beside_what_was_sampled(tmp_path):
@@ -71,9 +71,9 @@ def test_certificates_stand_beside_what_was_sampled(tmp_path):
     (folder / "certificates").mkdir()
     (folder / "certificates" / "summary.json").write_text('{"001": null}')
     first, second = rows(tables.certificates([proved(folder, **read_run(folder).certificates)]))
-    assert (first["sum sampled"], first["sum shown"], first["rung"]) == (333, 330, "proved")
+    assert (first["sum sampled"], first["sum shown"], first["guarantee"]) == (333, 330, "proved")
     assert math.isclose(first["sum shown / sampled"], 330 / 333)
-    assert second["rung"] == "none: no goal region could be shown"
+    assert second["guarantee"] == "none: no goal region could be shown"
 
 
 @pytest.mark.parametrize(
