@@ -45,6 +45,8 @@ def optimize(config: Config, folder: Path, console: Console, cluster: Cluster) -
     example = jax.eval_shape(make_evaluate(problem), genomes, jax.random.key(0))
     with RunFolder.open(folder, config, cluster) as run:
         begun = run.restore(search.start(plan, example))
+        for note in run.notes:
+            console.message(note)
         done = int(begun.generation)
         whole = bool(cluster.agreed(np.asarray((folder / LAST_FILE).is_file())))
         if done == config.search.generations and whole:
@@ -58,7 +60,7 @@ def optimize(config: Config, folder: Path, console: Console, cluster: Cluster) -
         again = _Again(problem, cluster, example)
         state, pace = begun, _Pace(config)
         try:
-            for state, generation in search.run(plan, evaluate, begun):
+            for state, generation in _first_announced(search.run(plan, evaluate, begun), console):
                 run.append(vars(generation))
                 run.save_if_due(state, int(state.generation))
                 console.progress(pace.progress(generation))
@@ -72,6 +74,17 @@ def optimize(config: Config, folder: Path, console: Console, cluster: Cluster) -
         finished = search.finish(plan, state, _stacked(found[:-1], state.elites))
         cluster.on_first(lambda: _store(problem, finished, found[-1], run, console))
         return True
+
+
+def _first_announced(
+    steps: Iterator[tuple[search.SearchState, search.Generation]], console: Console
+) -> Iterator[tuple[search.SearchState, search.Generation]]:
+    """The same steps; while the first one compiles, the console says so."""
+    with console.waiting("compiling and evaluating the first generation"):
+        first = next(steps, None)
+    if first is not None:
+        yield first
+        yield from steps
 
 
 class _Pace:
