@@ -16,7 +16,7 @@ from tests.paths import ROOT
 
 SHOW = (
     "import jax, rtcd_jax; rtcd_jax.prepare_jax({}); "
-    "print(jax.config.read('jax_compilation_cache_dir'), jax.config.read('jax_compilation_cache_max_size') > 0)"
+    "print(jax.config.jax_compilation_cache_dir, jax.config.jax_compilation_cache_max_size > 0)"
 )
 
 
