@@ -139,7 +139,7 @@ def _headlines(run: Run) -> Iterator[tuple[str, str, str]]:
     else:
         yield "proof", certificate.guarantee, "of the best's funnel"
     kept = [seen.get("kept") for seen in run.verification.values()]
-    seen = ("promises kept" if all(kept) else "PROMISE BROKEN") if kept else "none yet"
+    seen = ("not refuted" if all(kept) else "REFUTED") if kept else "none yet"
     yield "verification", seen, "by independent simulators" if kept else "rtcd verify"
 
 

@@ -53,11 +53,13 @@ def elites(run: Run) -> Table:
         for name, certificate in run.certificates.items()
         if certificate.shown
     }
+    varied, compared = (any(record.get(key) for record in run.elites.values()) for key in ("spread", "mjx"))
     heads = (
         "elite", *(f"{words(name)} [{unit}]" for name, unit in plant.design.items()), *_weight_heads(run),
         *(POLICY[name] for name in options),
         *(f"{words(name)} [{volume_unit(run.config, name)}]" for name in VOLUMES), "sum × initial",
-        "largest knot [%]", "swing-up [s]", "ε", "guarantee", *(["sum shown", "guarantee shown"] if shown else []),
+        "largest knot [%]", "swing-up [s]", "ε", "guarantee", *(["spread of sum [%]"] if varied else []),
+        *(["MJX − closed form"] if compared else []), *(["sum shown", "guarantee shown"] if shown else []),
     )  # fmt: skip
     before = run.initial.volumes["sum"] if run.initial else 0.0
     rows = []
@@ -69,9 +71,17 @@ def elites(run: Run) -> Table:
             *(volumes[key] for key in VOLUMES),
             ratio(volumes["sum"], before), 100 * volumes["share_of_largest_knot"], record["duration"],
             record["epsilon"], record["rung"],
+            *([_percent(record.get("spread"))] if varied else []),
+            *([(record.get("mjx") or {}).get("difference")] if compared else []),
         )  # fmt: skip
         rows.append((*row, *shown.get(name, (None, None))) if shown else row)
     return Table(heads, tuple(rows))
+
+
+def _percent(spread: Mapping[str, Any] | None) -> float | None:
+    """The sum's relative standard deviation over the random numbers [%]; only the best elite has one."""
+    share = spread["volumes"]["sum"] if spread else None
+    return None if share is None else 100 * share
 
 
 def certificates(runs: Sequence[Run]) -> Table | None:
@@ -99,16 +109,21 @@ def verification(runs: Sequence[Run]) -> Table | None:
     """What the witnesses saw; None before `rtcd verify`."""
     heads = (
         *_run_head(runs), "funnel", "witness", "states", "left funnel", "left limits", "missed goal",
-        "failure rate", "at most", "promised", "confidence", "promise",
+        "failure rate", "at least", "at most", "promised", "confidence", "promise",
     )  # fmt: skip
     rows = []
     for run in runs:
         for name, record in run.verification.items():
             for witness, seen in record.get("witnesses", {}).items():
-                counts = [seen.get(key) for key in ("left_funnel", "left_limits", "missed_goal", "rate", "rate_upper")]
-                promise = [record.get("epsilon"), record.get("confidence"), "kept" if seen.get("kept") else "BROKEN"]
+                counts = [seen.get(key) for key in ("left_funnel", "left_limits", "missed_goal")]
+                counts += [seen.get(key) for key in ("rate", "rate_lower", "rate_upper")]
+                promise = [record.get("epsilon"), record.get("confidence"), _refuted(not seen.get("kept"))]
                 rows.append((*_run_cell(runs, run), name, witness, record.get("states"), *counts, *promise))
     return Table(heads, tuple(rows)) if rows else None
+
+
+def _refuted(refuted: bool) -> str:
+    return "REFUTED" if refuted else "not refuted"
 
 
 def experiment(found: Experiment) -> Table:
@@ -158,7 +173,7 @@ def _compared(run: Run, options: Sequence[str]) -> tuple[Cell, ...]:
         *(run.best.volumes[name] for name in VOLUMES),
         ratio(run.best.volumes["sum"], before) if before is not None else None, record["rung"],
         *((found.shown["sum"], found.guarantee) if found and found.shown else (None, None)),
-        ("kept" if all(kept) else "BROKEN") if kept else None, wall_time(run),
+        _refuted(not all(kept)) if kept else None, wall_time(run),
     )  # fmt: skip
 
 

@@ -65,6 +65,17 @@ def test_elites_are_told_with_designs_weights_volumes_and_guarantee(tmp_path):
     assert (first["sum shown"], first["guarantee shown"], second["sum shown"]) == (330.0, "proved", None)
 
 
+def test_elites_tell_their_spread_and_what_mjx_saw(tmp_path):
+    folder = finished(tmp_path / "run")
+    assert not {"spread of sum [%]", "MJX − closed form"} & rows(tables.elites(read_run(folder)))[0].keys()
+    best = folder / "elites" / "000.json"
+    found = {"spread": {"keys": 5, "volumes": {"sum": 0.004}}, "mjx": {"difference": 2e-12}}
+    best.write_text(json.dumps(json.loads(best.read_text()) | found))
+    first, second = rows(tables.elites(read_run(folder)))
+    assert (first["spread of sum [%]"], first["MJX − closed form"]) == (0.4, 2e-12)
+    assert (second["spread of sum [%]"], second["MJX − closed form"]) == (None, None)
+
+
 def test_certificates_stand_beside_what_was_sampled(tmp_path):
     folder = finished(tmp_path / "run")
     assert tables.certificates([read_run(folder)]) is None
@@ -93,7 +104,7 @@ def test_verification_tells_what_each_witness_saw(tmp_path):
     folder = finished(tmp_path / "run")
     assert tables.verification([read_run(folder)]) is None
     (row,) = rows(tables.verification([read_run(verify_and_disturb(folder))]))
-    assert (row["funnel"], row["witness"], row["states"], row["promise"]) == ("000", "C MuJoCo", 1020, "kept")
+    assert (row["funnel"], row["witness"], row["states"], row["promise"]) == ("000", "C MuJoCo", 1020, "not refuted")
     assert (row["at most"], row["promised"], row["confidence"]) == (0.0045, 0.0043, 0.99)
 
 
@@ -117,7 +128,7 @@ def test_runs_are_compared_row_by_row(tmp_path):
     first, second = rows(tables.comparison(compared([proved(folders[0]), read_run(folders[1])])))
     assert (first["run"], first["sum"], first["sum × initial"], first["sum shown"]) == ("rtc", 222, 2, 330)
     assert (second["run"], second["sum"], second["sum × initial"], second["sum shown"]) == ("rtcd", 555, 5, None)
-    assert (first["promise"], second["promise"]) == ("kept", None)
+    assert (first["promise"], second["promise"]) == ("not refuted", None)
 
 
 def test_provenance_names_configuration_and_starts(tmp_path):
