@@ -66,7 +66,8 @@ def test_elites_are_told_with_designs_weights_volumes_and_guarantee(tmp_path):
 
 
 def test_elites_tell_their_spread_and_what_mjx_saw(tmp_path):
-    folder = finished(tmp_path / "run")
+    config = experiment()
+    folder = run_folder(tmp_path / "run", config, candidate(config), [candidate(config), candidate(config, 1)])
     assert not {"spread of sum [%]", "MJX − closed form"} & rows(tables.elites(read_run(folder)))[0].keys()
     best = folder / "elites" / "000.json"
     found = {"spread": {"keys": 5, "volumes": {"sum": 0.004}}, "mjx": {"difference": 2e-12}}

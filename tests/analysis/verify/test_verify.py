@@ -109,7 +109,7 @@ def test_a_small_funnel_about_the_upright_keeps_its_promise():
     for witness in WITNESSES:
         assert result.failures(witness) == 0
         assert result.interval(witness)[0] == 0
-    assert result.kept
+    assert not result.refuted
 
 
 def test_a_funnel_a_hundred_times_too_large_is_refuted_by_both_witnesses():
@@ -120,7 +120,7 @@ def test_a_funnel_a_hundred_times_too_large_is_refuted_by_both_witnesses():
         assert outcome.left_funnel.any()
         assert outcome.missed_goal.any()
         np.testing.assert_array_equal(outcome.failed, outcome.left_funnel | outcome.left_limits | outcome.missed_goal)
-    assert not result.kept
+    assert result.refuted
 
 
 @pytest.mark.parametrize("level", [HELD, 10 * HELD, 100 * HELD])
