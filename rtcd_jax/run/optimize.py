@@ -157,8 +157,8 @@ def _summary(problem: Problem, initial: Reported, best: Reported) -> Iterator[st
     for name in OBJECTIVES:
         cells = [f"{name:18}"]
         for record in (before, after):
-            spread = record["spread"]["volumes"][name] if record["spread"] else math.nan
-            cells.append(f"{record['volumes'][name]:12.5g}{f'{spread:.1%}' if math.isfinite(spread) else '-':>9}")
+            spread = record["spread"]["volumes"][name] if record["spread"] else None
+            cells.append(f"{record['volumes'][name]:12.5g}{'-' if spread is None else f'{spread:.1%}':>9}")
         first, last = before["volumes"][name], after["volumes"][name]
         cells.append(f"{last / first:9.2f}" if first > 0 else f"{'-':>9}")
         yield "".join(cells)

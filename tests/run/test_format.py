@@ -12,6 +12,8 @@ from rtcd_jax.config.load import config_hash
 from rtcd_jax.elite.elite import Elite
 from rtcd_jax.elite.records import write_elite
 from rtcd_jax.run.format import arrays_of, epsilon, record_of
+from rtcd_jax.run.optimize import _summary
+from rtcd_jax.run.reevaluation import Reported
 from rtcd_jax.system.files import plain
 from tests import pipeline
 
@@ -170,3 +172,17 @@ def test_the_spread_is_that_over_the_keys():
     assert spread["volumes"]["sum"] == pytest.approx(0.01, rel=1e-9)
     assert spread["volumes"]["inlet"] == pytest.approx(0, abs=1e-12)
     assert plain(record_of(pipeline.problem(), evaluation))["spread"] is None
+
+
+def test_without_volumes_there_is_no_spread():
+    hard = _row(pipeline.HARD)
+    assert set(record_of(pipeline.problem(), hard, [hard, hard])["spread"]["volumes"].values()) == {None}
+
+
+def test_the_summary_has_a_dash_where_a_number_is_none():
+    hard, best = _row(pipeline.HARD), _row(pipeline.RTCD)
+    initial, first = Reported(hard, [hard, hard], None), Reported(best, [best, best], None)
+    lines = list(_summary(pipeline.problem(), initial, first))
+    total = float(best.volumes.total)
+    assert lines[1].split() == ["sum", "0", "-", f"{total:.5g}", "0.0%", "-"]
+    assert "the initial candidate has no funnel" in lines[5]
