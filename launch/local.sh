@@ -4,9 +4,6 @@
 #   launch/local.sh configs/cartpole_rtcd.yaml --run checkpoints/cartpole_rtcd
 # Its output goes to rtcd.log; `kill -TERM PROCESS` saves and stops it.
 set -euo pipefail
-export JAX_COMPILATION_CACHE_DIR="${JAX_COMPILATION_CACHE_DIR:-$PWD/.jax_cache}"
-export JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS=0
-export JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES=-1
 rtcd=${RTCD:-$(command -v rtcd || echo .venv/bin/rtcd)}
 command -v "$rtcd" >/dev/null || { echo "no $rtcd here: \`make run\` in the repository's root makes it" >&2; exit 2; }
 nohup "$rtcd" optimize "$@" >>rtcd.log 2>&1 </dev/null &

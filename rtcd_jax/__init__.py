@@ -14,6 +14,7 @@ from typing import Any
 
 _HOMES = {
     "Config": "config.load",
+    "prepare_jax": "system.devices",
     "load": "config.load",
     "parse_yaml": "config.load",
     "ConfigError": "system.errors",

@@ -17,9 +17,10 @@ from rtcd_jax.numerics.interior_point import CACHE, VECTOR
 from rtcd_jax.numerics.loops import on_gpu
 from rtcd_jax.policy import stabilize
 from rtcd_jax.problem import Problem
+from rtcd_jax.system.devices import path_batch
 from rtcd_jax.trajectory import plan
 from rtcd_jax.types import Candidate, Evaluation, Policy, Trajectory
-from rtcd_jax.validation import Dynamics, Effort
+from rtcd_jax.validation import Dynamics, PhysicsComparison, Rollouts, SamplingBudget, compare_physics
 from rtcd_jax.volume import funnel_volume
 
 TEMPORARIES = 16
@@ -28,40 +29,52 @@ MOST_ON_A_CPU = 512
 
 Evaluate = Callable[[jax.Array, jax.Array], Evaluation]
 
+FIRST_SAMPLES = 2000
+"""Held-out samples a knot, at most, of the first, cheap rounds of the elites, and of those under further keys."""
 
-def search_effort(problem: Problem) -> Effort:
-    """That of a generation: two rounds of fresh states, a share of them through MJX if the rollouts are mixed."""
+
+def search_budget(problem: Problem) -> SamplingBudget:
+    """That of a generation: two rounds of held-out samples, a share of them through MJX if the rollouts are mixed."""
     funnel = problem.config.funnel
     share = rollout.mjx(problem.plant) if funnel.rollouts == "mixed" else None
     use = rollout.mjx if funnel.rollouts == "mjx" else rollout.closed_form
     physics = use(problem.plant)
-    return Effort(funnel, Dynamics(physics, physics, share), rounds=2, follow=False)
+    return SamplingBudget(funnel, Dynamics(physics, physics, share), rounds=2)
 
 
-def elite_effort(problem: Problem) -> Effort:
-    """That of the elites: more directions and fresh states, through MJX unless all is closed form, until none fails.
-
-    Fresh states are then followed to the goal.
-    """
+def elite_budget(problem: Problem) -> SamplingBudget:
+    """That of the elites: more directions, held-out samples followed to the goal until a round has no failure."""
     config = problem.config
-    counts = {"directions": config.elites.directions, "trials": config.elites.trials}
-    use = rollout.closed_form if config.funnel.rollouts == "closed_form" else rollout.mjx
+    elites = config.elites
+    counts = {"directions": elites.directions, "trials": min(elites.trials, FIRST_SAMPLES)}
+    use = rollout.mjx if config.funnel.rollouts == "mjx" else rollout.closed_form
     physics = use(problem.plant)
     funnel = config.funnel.model_copy(update=counts)
-    return Effort(funnel, Dynamics(physics, physics), rounds=40, follow=True)
+    return SamplingBudget(
+        funnel, Dynamics(physics, physics), rounds=40, samples_per_knot=elites.trials, batch=path_batch()
+    )
 
 
-def make_evaluate(problem: Problem, effort: Effort | None = None) -> Evaluate:
+def elite_key() -> jax.Array:
+    """The random numbers with which elites and initial candidates are evaluated again, in every run.
+
+    A candidate has the same numbers in every run, whatever its seed and its generations; no search draws from this
+    key, since seeds are below 2^32.
+    """
+    return jax.random.key(1 << 32)
+
+
+def make_evaluate(problem: Problem, budget: SamplingBudget | None = None) -> Evaluate:
     """`evaluate(genomes [P d], key) -> Evaluation [P]`, to be jitted; all candidates share the key's random numbers.
 
-    Without an `effort` that of a generation is made.
+    Without a `budget` that of a generation is made.
     """
-    effort = effort or search_effort(problem)
+    budget = budget or search_budget(problem)
 
     def evaluate(genomes, key) -> Evaluation:
         candidates = jax.vmap(partial(decode, problem))(genomes)
         trajectories = plan(problem, candidates)
-        assess = partial(_assess, problem, effort, key)
+        assess = partial(_assess, problem, budget, key)
         count = genomes.shape[0]
         batch = count if on_gpu() else batch_in_cache(problem, count)
         padded = jax.tree.map(lambda leaf: _padded(leaf, -count % batch), (genomes, candidates, trajectories))
@@ -103,17 +116,37 @@ def _padded(leaf, count: int):
     return jnp.concatenate([leaf, jnp.repeat(leaf[-1:], count, axis=0)]) if count else leaf
 
 
-def resample(problem: Problem, effort: Effort, evaluation: Evaluation, key) -> Evaluation:
+def resample(
+    problem: Problem, budget: SamplingBudget, evaluation: Evaluation, key, samples_per_knot=None
+) -> Evaluation:
     """One candidate's evaluation with its funnel estimated anew about the same policy."""
-    return _with_funnel(problem, effort, key, evaluation.genome, evaluation.candidate, evaluation.funnel.policy)
+    known = evaluation.genome, evaluation.candidate, evaluation.funnel.policy
+    return _with_funnel(problem, budget, key, *known, samples_per_knot)
 
 
-def _assess(problem: Problem, effort: Effort, key, planned: tuple[jax.Array, Candidate, Trajectory]) -> Evaluation:
+def compare_with_mjx(problem: Problem, evaluation: Evaluation, key) -> PhysicsComparison:
+    """`elites.mjx_states` held-out samples of one candidate's funnel, followed to the goal by both physics."""
+    funnel, config = evaluation.funnel, problem.config
+    rollouts = Rollouts.of(problem, evaluation.candidate, funnel.policy, config.funnel)
+    return compare_physics(rollouts, funnel.levels, key, config.elites.mjx_states, rollout.mjx(problem.plant))
+
+
+def _assess(
+    problem: Problem, budget: SamplingBudget, key, planned: tuple[jax.Array, Candidate, Trajectory]
+) -> Evaluation:
     genome, candidate, trajectory = planned
     policy = stabilize(problem, candidate, trajectory)
-    return _with_funnel(problem, effort, key, genome, candidate, policy)
+    return _with_funnel(problem, budget, key, genome, candidate, policy)
 
 
-def _with_funnel(problem: Problem, effort: Effort, key, genome, candidate: Candidate, policy: Policy) -> Evaluation:
-    funnel = estimate_funnel(problem, candidate, policy, key, effort)
+def _with_funnel(
+    problem: Problem,
+    budget: SamplingBudget,
+    key,
+    genome,
+    candidate: Candidate,
+    policy: Policy,
+    samples_per_knot=None,
+) -> Evaluation:
+    funnel = estimate_funnel(problem, candidate, policy, key, budget, samples_per_knot)
     return Evaluation(genome, candidate, funnel, funnel_volume(funnel), funnel.status)

@@ -5,7 +5,7 @@
 (paper, section II-D.2, by simulation), knot by knot backward from rho_N, which comes from long rollouts under the
 goal's LQR. At every knot states are rolled out along rays through the set, on a ladder of radii about the next level's.
 Few random directions come near the worst one, and what each knot misses multiplies along the motion: the worst one is
-climbed to, from where it was at the knot behind. Fresh independent states confirm the whole (confirmation.py).
+climbed to, from where it was at knot k+1. Held-out samples validate the whole (validation.py).
 """
 
 from functools import partial
@@ -23,7 +23,7 @@ from rtcd_jax.numerics.loops import packed_scan, short_scan
 from rtcd_jax.numerics.sphere import climb
 from rtcd_jax.problem import Problem
 from rtcd_jax.types import Candidate, Funnel, Policy, Status, first_failure
-from rtcd_jax.validation import Effort, confirm, follow
+from rtcd_jax.validation import Rollouts, SamplingBudget, validate_intervals, validate_paths
 
 SMALLEST = 1e-3
 """Radius below which a set counts as empty, over the box's or that at which the goal's LQR saturates."""
@@ -42,25 +42,28 @@ MARGIN = 1e-3
 """Share of every level that is given away for the directions between the sampled ones."""
 
 
-def estimate_funnel(problem: Problem, candidate: Candidate, policy: Policy, key, effort: Effort) -> Funnel:
-    """The funnel of a policy (*sampled* rung); `key` fixes all directions, radii and fresh states.
+def estimate_funnel(
+    problem: Problem, candidate: Candidate, policy: Policy, key, budget: SamplingBudget, samples_per_knot=None
+) -> Funnel:
+    """The funnel of a policy (guarantee *sampled*); `key` fixes all directions, radii and held-out samples.
 
-    `trials[k]` fresh states, independent and uniform in the final B_k, were rolled out without a failure: over their
-    interval or, with `effort.follow`, to the goal. It is zero where the last pass still had to shrink the level.
+    `trials[k]` held-out samples, independent and uniform in the final B_k, were rolled out without a failure: over
+    their interval or, with `budget.samples_per_knot`, to the goal. It is zero where the last round had failures.
+    `samples_per_knot`, a number or a tracer, stands in for the budget's unless that is 0.
     Status: FUNNEL_EMPTY if some level is below the smallest one that counts.
     """
     keys = jax.random.split(key, 4)
-    sets = Ellipsoids.about(policy.trajectory.xs.T, jnp.moveaxis(policy.values, 0, -1))
+    rollouts = Rollouts.of(problem, candidate, policy, budget.funnel)
+    sets = rollouts.sets
     boxes = sets.radii_inside(jnp.asarray(problem.state_limits, sets.centers.dtype))
     saturated = _saturating_radius(problem, policy, sets.part(slice(-1, None)))
     boxes = jnp.minimum(boxes, REACH * saturated)
-    tracked = rollout.reference(problem, candidate, policy, effort.funnel.steps)
-    last = _goal_level(problem, candidate, policy, sets.part(slice(-1, None)), boxes[-1], keys[0], effort)
+    last = _goal_level(problem, candidate, policy, sets.part(slice(-1, None)), boxes[-1], keys[0], budget)
 
-    levels = _scan_knots(problem, candidate, sets, tracked, boxes, last, keys[1], effort)
-    levels, trials = confirm(problem, candidate, sets, tracked, levels, keys[2], effort)
-    if effort.follow:
-        levels, trials = follow(problem, candidate, policy, sets, tracked, levels, keys[3], effort)
+    levels = _scan_knots(rollouts, boxes, last, keys[1], budget)
+    levels, samples = validate_intervals(rollouts, levels, keys[2], budget)
+    if budget.samples_per_knot:
+        levels, samples = validate_paths(rollouts, levels, keys[3], budget, samples_per_knot)
     full = jnp.all(levels >= (jnp.minimum(boxes, saturated) * SMALLEST) ** 2) & jnp.all(boxes > 0)
     finite = jnp.all(jnp.isfinite(levels)) & jnp.all(jnp.isfinite(policy.values))
     status = first_failure(
@@ -68,27 +71,27 @@ def estimate_funnel(problem: Problem, candidate: Candidate, policy: Policy, key,
         jnp.where(finite, Status.OK, Status.NOT_FINITE),
         jnp.where(full, Status.OK, Status.FUNNEL_EMPTY),
     )
-    return Funnel(policy, levels, trials, status)
+    return Funnel(policy, levels, samples, status)
 
 
-def _scan_knots(problem, candidate, sets: Ellipsoids, tracked, boxes, last, key, effort: Effort):
+def _scan_knots(rollouts: Rollouts, boxes, last, key, budget: SamplingBudget):
     """Levels [N+1] backward from the `last` one."""
-    n, dtype, funnel = problem.plant.n, sets.centers.dtype, effort.funnel
+    n, dtype, funnel = rollouts.problem.plant.n, boxes.dtype, budget.funnel
 
     def backward(carry, knot):
-        target, shrinkage, climbers = carry
-        index, box, fresh = knot
-        step = _Step.at(problem, candidate, sets, tracked, index)
+        target, shrinkage, adversarial = carry
+        index, box, drawn = knot
+        step = _Step.at(rollouts, index)
 
         expected = jnp.minimum(jnp.sqrt(target) * shrinkage, box)
-        climbers = climb(partial(step.ends_alone, expected), climbers, funnel.climbs)
-        directions = jnp.concatenate([fresh, climbers], 1)
+        adversarial = climb(partial(step.ends_alone, expected), adversarial, funnel.climbs)
+        directions = jnp.concatenate([drawn, adversarial], 1)
 
         def look(radius, window):
             """The smallest radius at which a state leaves the boxes or misses the next set, seen from near `radius`."""
             ladder = jnp.minimum(radius * window ** np.linspace(-1, 1, RADII), box)
             radii = jnp.broadcast_to(ladder, (directions.shape[1], RADII))
-            reached, peaks = step.ends(radii, directions[..., None], effort.dynamics.directions)
+            reached, peaks = step.ends(radii, directions[..., None], budget.dynamics.directions)
             # Each for itself: between V and a peak that is near one all the way nothing can be interpolated.
             shares = jnp.sum(reached**2, 0) / target, peaks**2
             value, peak = (jnp.where(jnp.isnan(share), jnp.inf, share) for share in shares)
@@ -97,15 +100,15 @@ def _scan_knots(problem, candidate, sets: Ellipsoids, tracked, boxes, last, key,
 
         radius, bad = short_scan(look, jnp.sqrt(target), jnp.asarray(WINDOWS, dtype))
         level = (1 - MARGIN) * radius**2
-        # The worst of the random ones takes the place of the tamest climber: there may be several maxima.
-        newcomer = _worst(fresh, bad[-1, : funnel.directions], 1)
-        survivors = _worst(climbers, bad[-1, funnel.directions :], funnel.climbers - 1)
+        # The worst of the drawn ones replaces the least bad adversarial one: there may be several maxima.
+        newcomer = _worst(drawn, bad[-1, : funnel.directions], 1)
+        survivors = _worst(adversarial, bad[-1, funnel.directions :], funnel.climbers - 1)
         return (level, jnp.sqrt(level / target), jnp.concatenate([newcomer, survivors], 1)), level
 
     keys = jax.random.split(key, boxes.shape[0])
     start = last, jnp.ones((), dtype), sampling.directions(keys[-1], funnel.climbers, n, dtype)
-    fresh = jax.vmap(lambda key: sampling.directions(key, funnel.directions, n, dtype))(keys[:-1])
-    knots = jnp.arange(boxes.shape[0] - 1), boxes[:-1], fresh
+    drawn = jax.vmap(lambda key: sampling.directions(key, funnel.directions, n, dtype))(keys[:-1])
+    knots = jnp.arange(boxes.shape[0] - 1), boxes[:-1], drawn
     _, levels = packed_scan(backward, start, knots, reverse=True)
     return jnp.append(levels, last)
 
@@ -118,27 +121,26 @@ def _worst(directions, bad, count: int):
 class _Step(NamedTuple):
     """One interval: the sets at both its ends, and what carries a state from one to the other."""
 
-    problem: Problem
-    candidate: Candidate
+    rollouts: Rollouts
     here: Ellipsoids
     there: Ellipsoids
-    tracked: rollout.Reference
+    tracking: rollout.TrackingData
 
     @classmethod
-    def at(cls, problem, candidate, sets: Ellipsoids, tracked, index) -> "_Step":
+    def at(cls, rollouts: Rollouts, index) -> "_Step":
         one = index + np.arange(1)
-        return cls(problem, candidate, sets.part(one), sets.part(one + 1), tracked.part(one))
+        return cls(rollouts, rollouts.sets.part(one), rollouts.sets.part(one + 1), rollouts.tracking.part(one))
 
     def ends(self, radii, y, dynamics):
         """Ends [n ...] of the states `radii` times `y` [n ...], as points of the next set's ball, and peaks [...]."""
         shape = jnp.broadcast_shapes(jnp.shape(radii), y.shape[1:])
         x = self.here.points(jnp.broadcast_to(radii, shape)[None], y[:, None])
-        ends, peaks = rollout.roll_intervals(self.problem, self.candidate, self.tracked, x, dynamics)
+        ends, peaks = self.rollouts.roll(self.tracking, x, dynamics)
         return self.there.to_ball(ends)[:, 0], peaks[0]
 
     def ends_alone(self, radii, y):
         """The ends under the plant's own equations."""
-        return self.ends(radii, y, rollout.closed_form(self.problem.plant))[0]
+        return self.ends(radii, y, rollout.closed_form(self.rollouts.problem.plant))[0]
 
 
 def _saturating_radius(problem, policy, goal_set: Ellipsoids):
@@ -148,13 +150,13 @@ def _saturating_radius(problem, policy, goal_set: Ellipsoids):
     return jnp.min(jnp.asarray(problem.input_limits, largest.dtype) / largest)
 
 
-def _goal_level(problem, candidate, policy, goal_set: Ellipsoids, box, key, effort: Effort):
+def _goal_level(problem, candidate, policy, goal_set: Ellipsoids, box, key, budget: SamplingBudget):
     """rho_N: V decreases over `horizon` from every sampled state below it, inside the boxes.
 
     V then decreases at all multiples of the horizon, so that every state arrives: a Lyapunov function of the map over
     the horizon, which for a long one reaches out to the ellipsoid's whole region of attraction.
     """
-    goal, gain = effort.funnel.goal, policy.gains[-1]
+    goal, gain = budget.funnel.goal, policy.gains[-1]
 
     def narrow(bracket, key):
         """Of a ladder of radii over the bracket, the last good one and the one above it, and the crossing between."""
@@ -163,7 +165,7 @@ def _goal_level(problem, candidate, policy, goal_set: Ellipsoids, box, key, effo
         directions = sampling.directions(key, goal.directions, problem.plant.n, box.dtype)
         grid = jnp.broadcast_to(ladder, (goal.directions, goal.radii))
         x = goal_set.points(grid[None], directions[:, None, :, None])
-        dynamics = effort.dynamics.directions
+        dynamics = budget.dynamics.directions
         ends, peaks = rollout.roll_at_goal(problem, candidate, gain, x, dynamics, goal.horizon, goal.step)
         crossing = jnp.min(_crossings(grid, jnp.maximum(goal_set.level(ends) / grid**2, peaks**2)[0]))
         index = jnp.clip(jnp.searchsorted(ladder, crossing, side="right") - 1, 0, goal.radii - 2)

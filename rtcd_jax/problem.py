@@ -10,6 +10,7 @@ import numpy as np
 from rtcd_jax.config.load import Config
 from rtcd_jax.plants import plant_class
 from rtcd_jax.plants.base import Plant
+from rtcd_jax.system.devices import require_float64
 from rtcd_jax.system.errors import ConfigError
 from rtcd_jax.system.errors import Problem as Fault
 
@@ -71,9 +72,11 @@ def make_problem(config: Config) -> Problem:
     """The problem that a configuration describes.
 
     Raises:
+        UserError: if JAX computes in float32.
         ConfigError: if the goal is no equilibrium of the initial design without input.
         UserError: if the robot's MJCF does not move as its equations say, at random states, inputs and designs.
     """
+    require_float64()
     constants = config.plant.model_dump(exclude={"name"})
     plant = plant_class(config.plant.name)(**constants)
     problem = Problem(

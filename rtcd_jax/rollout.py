@@ -48,20 +48,22 @@ def mjx(plant: Plant) -> Dynamics:
     return Dynamics(rate, large=True)
 
 
-class Reference(NamedTuple):
-    """The controller's data at both ends and the middle of every Runge-Kutta step: leading axes (step, stage)."""
+class TrackingData(NamedTuple):
+    """Feed-forward and gain schedule: what the controller looks up at both ends and the middle of every Runge-Kutta
+    step. Leading axes are (step, stage).
+    """
 
     states: Float[Array, "T 3 n N"]
     gains: Float[Array, "T 3 m n N"]
     inputs: Float[Array, "m N"]
     step: Float[Array, ""]
 
-    def part(self, which) -> "Reference":
+    def part(self, which) -> "TrackingData":
         """The intervals `which`."""
-        return Reference(self.states[..., which], self.gains[..., which], self.inputs[..., which], self.step)
+        return TrackingData(self.states[..., which], self.gains[..., which], self.inputs[..., which], self.step)
 
 
-def reference(problem: Problem, candidate: Candidate, policy: Policy, steps: int) -> Reference:
+def tracking_data(problem: Problem, candidate: Candidate, policy: Policy, steps: int) -> TrackingData:
     """The nominal motion and the gains that `steps` Runge-Kutta steps an interval look up."""
     motion = nominal(problem, candidate, policy.trajectory)
     grid = np.arange(2 * steps + 1) / (2 * steps)
@@ -69,7 +71,7 @@ def reference(problem: Problem, candidate: Candidate, policy: Policy, steps: int
     gains = jnp.moveaxis(policy.gains, 0, -1)[None]
     shares = grid[:, None, None, None]
     blended = (1 - shares) * gains[..., :-1] + shares * gains[..., 1:]
-    return Reference(
+    return TrackingData(
         states=jnp.moveaxis(motion.at(grid), -1, 0)[stages],
         gains=blended[stages],
         inputs=motion.inputs,
@@ -77,14 +79,14 @@ def reference(problem: Problem, candidate: Candidate, policy: Policy, steps: int
     )
 
 
-def roll_intervals(problem: Problem, candidate: Candidate, tracked: Reference, x, dynamics: Dynamics):
+def roll_intervals(problem: Problem, candidate: Candidate, tracking: TrackingData, x, dynamics: Dynamics):
     """End states [n N ...] after one interval each, and the largest |x_i| / limit_i at any step [N ...].
 
     `x` [n N ...] are states at the intervals' starts.
     """
     limits, bounds = problem.state_limits, _column(problem.input_limits, x)
     align = partial(_align, behind=x.ndim - 2)
-    feedforward = align(tracked.inputs)
+    feedforward = align(tracking.inputs)
 
     def step(carry, stage):
         x, peak = carry
@@ -95,11 +97,11 @@ def roll_intervals(problem: Problem, candidate: Candidate, tracked: Reference, x
             u = jnp.clip(feedforward - _feedback(align(gains[place]), error), -bounds, bounds)
             return split(dynamics.rate(candidate.design, jnp.stack(x), u))
 
-        x = _step(slope, x, tracked.step, dynamics.large)
+        x = _step(slope, x, tracking.step, dynamics.large)
         return (x, jnp.maximum(peak, _fill(x, limits))), None
 
     x = split(x)
-    (x, peak), _ = short_scan(step, (x, _fill(x, limits)), (tracked.states, tracked.gains))
+    (x, peak), _ = short_scan(step, (x, _fill(x, limits)), (tracking.states, tracking.gains))
     return jnp.stack(x), peak
 
 

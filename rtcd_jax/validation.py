@@ -1,125 +1,296 @@
-"""Fresh states for a funnel: what (epsilon, beta) rests on.
+"""Funnel -> epsilon: held-out samples, independent of whatever chose the levels.
 
-Independent states, uniform in each ellipsoid, are rolled out; a failure shrinks its level, and everything is repeated
-with new states until a whole pass has none. M states without a failure leave a failure probability of at most
-1 - beta^(1/M) with confidence 1 - beta.
+States uniform in each ellipsoid are rolled out; a failure shrinks its level, and everything is repeated with new states
+until a whole round has none. At the start of a round its levels are fixed and its states are new: if some knot's
+failure probability is above epsilon, the round is clean with a probability of at most (1 - epsilon)^M for M states a
+knot. At most R rounds are made and the first clean one ends them, so that the levels that stand are wrong with a
+probability of at most R (1 - epsilon)^M, whatever the rounds before did to them (docs/theory.md, section 4).
 """
 
 import dataclasses
 from collections.abc import Callable
+from functools import partial
 from typing import NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from rtcd_jax import rollout
-from rtcd_jax.config.schema import FunnelConfig
+from rtcd_jax.config.schema import FunnelConfig, GoalConfig
 from rtcd_jax.numerics import sampling
 from rtcd_jax.numerics.ellipsoid import Ellipsoids
 from rtcd_jax.numerics.loops import packed_scan
+from rtcd_jax.problem import Problem
+from rtcd_jax.types import Candidate, Policy, Status
 
 SAFETY = 0.98
-"""Level over that of the lowest fresh state that failed."""
+"""Level over that of the lowest held-out sample that failed."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Dynamics:
-    """Whose physics the directions and the fresh states feel; `share` a part of these."""
+    """Whose physics the directions and the held-out samples feel; `share` a part of these."""
 
     directions: rollout.Dynamics
-    fresh: rollout.Dynamics
+    held_out: rollout.Dynamics
     share: rollout.Dynamics | None = None
 
 
 @dataclasses.dataclass(frozen=True)
-class Effort:
+class SamplingBudget:
     """How thoroughly a funnel is sampled.
 
-    `rounds` of fresh states at most, and whether these are followed to the goal in the end.
+    `rounds` of held-out samples at most: of `funnel.trials` states a knot over one interval, then of as many to the
+    goal, and at last of `samples_per_knot` to the goal (0: none of either), `batch` states at a time.
     """
 
     funnel: FunnelConfig
     dynamics: Dynamics
     rounds: int
-    follow: bool
+    samples_per_knot: int = 0
+    batch: int = 2048
 
 
-class _Confirmed(NamedTuple):
+class Rollouts(NamedTuple):
+    """What rollouts of a policy need, over one interval or from any knot to the goal."""
+
+    problem: Problem
+    candidate: Candidate
+    policy: Policy
+    sets: Ellipsoids
+    tracking: rollout.TrackingData
+    goal: GoalConfig
+
+    @classmethod
+    def of(cls, problem: Problem, candidate: Candidate, policy: Policy, funnel: FunnelConfig) -> "Rollouts":
+        sets = Ellipsoids.about(policy.trajectory.xs.T, jnp.moveaxis(policy.values, 0, -1))
+        tracking = rollout.tracking_data(problem, candidate, policy, funnel.steps)
+        return cls(problem, candidate, policy, sets, tracking, funnel.goal)
+
+    @property
+    def intervals(self) -> int:
+        return self.sets.centers.shape[1] - 1
+
+    def roll(self, tracking: rollout.TrackingData, x, dynamics: rollout.Dynamics):
+        """End states [n N ...] and peaks [N ...] of states [n N ...] after one interval each."""
+        return rollout.roll_intervals(self.problem, self.candidate, tracking, x, dynamics)
+
+    def interval(self, x, k, dynamics: rollout.Dynamics):
+        """States [n S] after interval `k`, and whether they stayed in the boxes till then [S]."""
+        ends, peaks = self.roll(self.tracking.part(k + np.arange(1)), x[:, None], dynamics)
+        return ends[:, 0], peaks[0] <= 1
+
+    def arrive(self, x, dynamics: rollout.Dynamics):
+        """States [n S] after the horizon behind t_N, and whether they came closer to the goal, inside the boxes [S]."""
+        gain, goal = self.policy.gains[-1], self.goal
+        ends, peaks = rollout.roll_at_goal(self.problem, self.candidate, gain, x, dynamics, goal.horizon, goal.step)
+        return ends, (peaks <= 1) & (self.level(ends, self.intervals) < self.level(x, self.intervals))
+
+    def level(self, x, k):
+        """V_k [S] of states [n S] at one knot."""
+        return self.sets.part(k + np.arange(1)).level(x[:, None])[0]
+
+    def uniform(self, levels, born, key):
+        """States [n S], uniform in the ellipsoid of the knot [S] in which each is born."""
+        y = sampling.ball(key, born.shape, self.sets.centers.shape[0], levels.dtype)
+        return self.sets.part(born).points(jnp.sqrt(levels)[born], y)
+
+
+class _Validated(NamedTuple):
     levels: Float[Array, " K"]
     failures: Int[Array, " K"]
     clean: Bool[Array, ""]
     round: Int[Array, ""]
 
 
-def confirm(problem, candidate, sets: Ellipsoids, tracked, levels, key, effort: Effort):
-    """Levels [K] and trials [K] after fresh states were rolled out over one interval each: B_k into B_{k+1}.
+def validate_intervals(rollouts: Rollouts, levels, key, budget: SamplingBudget):
+    """Levels [K] and samples [K] after held-out states were rolled out over one interval each: B_k into B_{k+1}.
 
-    The last level keeps zero trials: no interval starts there.
+    The last level keeps zero samples: no interval starts there.
     """
-    starts, nexts = sets.part(slice(0, -1)), sets.part(slice(1, None))
+    starts, nexts = rollouts.sets.part(slice(0, -1)), rollouts.sets.part(slice(1, None))
+    count = budget.funnel.trials
 
-    def one_pass(levels, key):
+    def one_round(levels, key):
         inner, share = jax.random.split(key)
-        x = _fresh(starts, levels[:-1], inner, effort.funnel.trials)
-        ends, peaks = rollout.roll_intervals(problem, candidate, tracked, x, effort.dynamics.fresh)
-        if effort.dynamics.share is not None:
-            which = _share(share, x.shape[1], effort.funnel)
-            part = tracked.part(which.knots)
+        x = _uniform(starts, levels[:-1], inner, count)
+        ends, peaks = rollouts.roll(rollouts.tracking, x, budget.dynamics.held_out)
+        if budget.dynamics.share is not None:
+            which = _share(share, x.shape[1], budget.funnel)
             chosen = x[:, which.knots, : which.states]
-            new_ends, new_peaks = rollout.roll_intervals(problem, candidate, part, chosen, effort.dynamics.share)
+            new_ends, new_peaks = rollouts.roll(rollouts.tracking.part(which.knots), chosen, budget.dynamics.share)
             ends = ends.at[:, which.knots, : which.states].set(new_ends)
             peaks = peaks.at[which.knots, : which.states].set(new_peaks)
         shrunk, failures = _shrink(levels, starts.level(x), nexts.level(ends), peaks <= 1)
         return shrunk, jnp.append(failures, 0)
 
-    done = _repeat(one_pass, levels, key, effort.rounds)
-    trials = jnp.where(done.failures == 0, effort.funnel.trials, 0).at[-1].set(0)
-    return done.levels, trials.astype(jnp.int32)
+    done = _repeat(one_round, levels, key, budget.rounds)
+    samples = jnp.where(done.failures == 0, count, 0).at[-1].set(0)
+    return done.levels, samples.astype(jnp.int32)
 
 
-def follow(problem, candidate, policy, sets: Ellipsoids, tracked, levels, key, effort: Effort):
-    """Levels [K] and trials [K] after fresh states of all knots were followed to the goal, by the closed form.
+def validate_paths(rollouts: Rollouts, levels, key, budget: SamplingBudget, samples_per_knot=None):
+    """Levels [K] and samples [K] after held-out states of all knots were followed to the goal, by the closed form.
+
+    First in rounds of `budget.funnel.trials` states a knot, which are cheap, until one is clean, then in rounds of
+    `samples_per_knot` (a number or a tracer; the budget's), on which epsilon rests.
 
     A state fails if it leaves the funnel at a later knot, leaves the boxes, or does not come closer to the goal (by its
     V) over the horizon after t_N. Wherever a path leaves the funnel, the level from which it left is the one to shrink:
     paths of many knots run together, into corners that states uniform in that knot's ellipsoid hardly visit.
+
+    The states of a round go in batches, knot by knot from the first one: a batch starts at the first knot of its own,
+    and only its states are held in memory. Each finds the levels as the batches before left them.
     """
-    count, goal = effort.funnel.trials, effort.funnel.goal
-    dynamics = rollout.closed_form(problem.plant)
-    knots = levels.shape[0]
-    born = np.repeat(np.arange(knots), count)[None]
-    last = sets.part(slice(-1, None))
+    knots, most = levels.shape[0], budget.samples_per_knot
+    batch = min(budget.batch, knots * most)
+    last_count = most if samples_per_knot is None else samples_per_knot
+    counts = jnp.stack([jnp.asarray(min(budget.funnel.trials, most), int), jnp.asarray(last_count, int)])
+    dynamics = rollout.closed_form(rollouts.problem.plant)
 
-    def one_pass(levels, key):
-        fresh = _fresh(sets, levels, key, count)
-        flat = fresh.reshape(fresh.shape[0], 1, -1)  # every state is in the same interval at the same time
+    # Without a funnel no round would ever be clean.
+    hopeful = (rollouts.policy.status == Status.OK) & jnp.all(jnp.isfinite(levels) & (levels > 0))
+    rounds = jnp.where(hopeful, budget.rounds, 0)
 
-        def interval(x, k):
-            ends, peaks = rollout.roll_intervals(problem, candidate, tracked.part(k + np.arange(1)), x, dynamics)
+    def one_batch(number, carry):
+        levels, failures, begun, count, key = carry
+        born = jnp.minimum((number * batch + np.arange(batch)) // count, knots - 1)  # the last batch is filled up
+        x = rollouts.uniform(begun, born, jax.random.fold_in(key, number))
+
+        def forward(k, state):
+            x, values, inside = state
             started = born <= k
-            return jnp.where(started, ends, x), (sets.part(k + np.arange(1)).level(x), peaks <= 1, started)
+            ends, within = rollouts.interval(x, k, dynamics)
+            values = values.at[k].set(rollouts.level(x, k))
+            return jnp.where(started, ends, x), values, inside.at[k].set(within)
 
-        x, path = jax.lax.scan(interval, flat, jnp.arange(knots - 1))
-        ends, peaks = rollout.roll_at_goal(problem, candidate, policy.gains[-1], x, dynamics, goal.horizon, goal.step)
-        arrives = (peaks <= 1) & (last.level(ends) < last.level(x))
-        final = _below(levels[-1], last.level(x), ~arrives)
+        blank = jnp.zeros((knots - 1, batch), x.dtype), jnp.zeros((knots - 1, batch), bool)
+        x, values, inside = jax.lax.fori_loop(born[0], knots - 1, forward, (x, *blank))
+        _, arrives = rollouts.arrive(x, dynamics)
+        last = rollouts.level(x, knots - 1)
+        final = _below(levels[-1], last, ~arrives)
 
         def backward(carry, knot):
             target, after, failed = carry
-            level, (here, inside, started) = knot
-            left = started & ~(inside & (after <= target))
-            shrunk = _below(level, here, left)
-            return (shrunk, here, failed | left), shrunk
+            k, level, value, within = knot
+            left = (born <= k) & ~(within & (after <= target))
+            shrunk = _below(level, value, left)
+            return (shrunk, value, failed | left), shrunk
 
-        (_, _, failed), shrunk = jax.lax.scan(
-            backward, (final, last.level(x), ~arrives), (levels[:-1], path), reverse=True
+        rows = jnp.arange(knots - 1), levels[:-1], values, inside
+        (_, _, failed), shrunk = jax.lax.scan(backward, (final, last, ~arrives), rows, reverse=True)
+        return jnp.append(shrunk, final), failures.at[born].add(failed), begun, count, key
+
+    def one_round(count, levels, key):
+        start = levels, jnp.zeros(knots, int), levels, count, key
+        return jax.lax.fori_loop(0, -(-knots * count // batch), one_batch, start)[:2]
+
+    def stage(levels, now):
+        count, key = now
+        done = _repeat(partial(one_round, count), levels, key, rounds)
+        return done.levels, jnp.where(done.failures == 0, count, 0)
+
+    levels, samples = jax.lax.scan(stage, levels, (counts, jax.random.split(key, 2)))
+    return levels, samples[-1].astype(jnp.int32)
+
+
+class PhysicsComparison(eqx.Module):
+    """MJX beside the closed form on `states` held-out states, followed from their knots to the goal.
+
+    `failures` of them fail by MJX. `difference` is the largest one of the two physics at any knot and at the end of the
+    horizon, in radii of that knot's ellipsoid: sqrt(V_k(x_mjx - x_closed) / rho_k). It is that of the state `start` of
+    `knot`, and `closed_form` and `mjx` are where it is `time` [s] then.
+    """
+
+    states: Int[Array, ""]
+    failures: Int[Array, ""]
+    difference: Float[Array, ""]
+    knot: Int[Array, ""]
+    time: Float[Array, ""]
+    start: Float[Array, " n"]
+    closed_form: Float[Array, " n"]
+    mjx: Float[Array, " n"]
+
+
+class _Pair(NamedTuple):
+    """States of both physics side by side, and the largest difference so far with where it was."""
+
+    closed_form: Float[Array, "n S"]
+    mjx: Float[Array, "n S"]
+    failed: Bool[Array, " S"]
+    difference: Float[Array, " S"]
+    place: Int[Array, " S"]
+    ends: Float[Array, "2 n S"]
+
+    def seen(self, place, difference) -> "_Pair":
+        """With the states of now where they differ more than ever; a NaN differs without limit."""
+        difference = jnp.where(jnp.isnan(difference), jnp.inf, difference)
+        larger = difference > self.difference
+        return self._replace(
+            difference=jnp.maximum(difference, self.difference),
+            place=jnp.where(larger, place, self.place),
+            ends=jnp.where(larger, jnp.stack([self.closed_form, self.mjx]), self.ends),
         )
-        return jnp.append(shrunk, final), jnp.sum(failed.reshape(knots, count), 1)
 
-    done = _repeat(one_pass, levels, key, effort.rounds)
-    return done.levels, jnp.where(done.failures == 0, count, 0).astype(jnp.int32)
+
+def compare_physics(rollouts: Rollouts, levels, key, states: int, mjx: rollout.Dynamics) -> PhysicsComparison:
+    """Follows `states` new states, spread evenly over the knots' ellipsoids, by the closed form and by `mjx`."""
+    closed_form = rollout.closed_form(rollouts.problem.plant)
+    knots = levels.shape[0]
+    blocks = -(-states // _MJX_BLOCK)
+    born = np.sort(np.arange(states) % knots)
+    born = np.append(born, np.repeat(born[-1:], -states % blocks)).reshape(blocks, -1)
+
+    def difference(x, other, k):
+        return jnp.sqrt(rollouts.sets.part(k + np.arange(1)).value_of_error((other - x)[:, None])[0] / levels[k])
+
+    def block(_, mine):
+        number, born = mine
+        x = rollouts.uniform(levels, born, jax.random.fold_in(key, number))
+
+        def forward(k, pair: _Pair) -> _Pair:
+            started = born <= k
+            ends, _ = rollouts.interval(pair.closed_form, k, closed_form)
+            other, inside = rollouts.interval(pair.mjx, k, mjx)
+            left = started & ~(inside & (rollouts.level(other, k + 1) <= levels[k + 1]))
+            pair = pair._replace(
+                closed_form=jnp.where(started, ends, pair.closed_form),
+                mjx=jnp.where(started, other, pair.mjx),
+                failed=pair.failed | left,
+            )
+            apart = difference(pair.closed_form, pair.mjx, k + 1)
+            return pair.seen(k + 1, jnp.where(started, apart, 0))
+
+        nothing = jnp.zeros(born.shape, bool), jnp.full(born.shape, -1.0), born, jnp.stack([x, x])
+        pair = jax.lax.fori_loop(born[0], knots - 1, forward, _Pair(x, x, *nothing))
+        ends, _ = rollouts.arrive(pair.closed_form, closed_form)
+        other, arrives = rollouts.arrive(pair.mjx, mjx)
+        pair = pair._replace(closed_form=ends, mjx=other, failed=pair.failed | ~arrives)
+        return None, (pair.seen(knots, difference(ends, other, knots - 1)), x)
+
+    _, (pairs, starts) = jax.lax.scan(block, None, (np.arange(blocks), born))
+    flat = jnp.argmax(pairs.difference)
+    where = flat // born.shape[1], flat % born.shape[1]
+    closed, other = pairs.ends[where[0], :, :, where[1]]
+    dt = rollouts.policy.trajectory.dt
+    place = pairs.place[where]
+    return PhysicsComparison(
+        states=jnp.asarray(states),
+        failures=jnp.sum(pairs.failed.reshape(-1)[:states]),
+        difference=pairs.difference[where],
+        knot=jnp.asarray(born)[where],
+        time=jnp.where(place == knots, (knots - 1) * dt + rollouts.goal.horizon, place * dt),
+        start=starts[where[0], :, where[1]],
+        closed_form=closed,
+        mjx=other,
+    )
+
+
+_MJX_BLOCK = 256
+"""States that MJX follows together: they start at the first knot of theirs, and wait till it is their turn."""
 
 
 def _below(level, values, failed):
@@ -128,16 +299,16 @@ def _below(level, values, failed):
     return jnp.minimum(level, SAFETY * lowest)
 
 
-def _repeat(one_pass: Callable, levels, key, rounds: int) -> _Confirmed:
-    def again(state: _Confirmed):
-        levels, failures = one_pass(state.levels, jax.random.fold_in(key, state.round))
-        return _Confirmed(levels, failures, jnp.sum(failures) == 0, state.round + 1)
+def _repeat(one_round: Callable, levels, key, rounds) -> _Validated:
+    def again(state: _Validated):
+        levels, failures = one_round(state.levels, jax.random.fold_in(key, state.round))
+        return _Validated(levels, failures, jnp.sum(failures) == 0, state.round + 1)
 
-    state = _Confirmed(levels, jnp.ones(levels.shape, int), jnp.asarray(False), jnp.asarray(0))  # nothing tried yet
+    state = _Validated(levels, jnp.ones(levels.shape, int), jnp.asarray(False), jnp.asarray(0))  # nothing tried yet
     return jax.lax.while_loop(lambda state: ~state.clean & (state.round < rounds), again, state)
 
 
-def _fresh(sets: Ellipsoids, levels, key, count: int):
+def _uniform(sets: Ellipsoids, levels, key, count: int):
     """States [n K count], uniform in each ellipsoid."""
     shape = (levels.shape[0], count)
     y = sampling.ball(key, shape, sets.centers.shape[0], levels.dtype)
@@ -145,7 +316,7 @@ def _fresh(sets: Ellipsoids, levels, key, count: int):
 
 
 def _shrink(levels, starts, ends, inside):
-    """Levels below the lowest fresh state that failed, backward over the knots, and how many failed [N]."""
+    """Levels below the lowest held-out sample that failed, backward over the knots, and how many failed [N]."""
 
     def backward(target, knot):
         level, starts, ends, inside = knot
@@ -164,7 +335,7 @@ class _Share(NamedTuple):
 
 
 def _share(key, knots: int, funnel: FunnelConfig) -> _Share:
-    """A random share of the fresh states, the same for all candidates.
+    """A random share of the held-out samples, the same for all candidates.
 
     The states of one knot are exchangeable: the first few of randomly chosen knots are as good as any.
     """

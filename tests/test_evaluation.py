@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from rtcd_jax.evaluation import make_evaluate, resample, search_effort
+from rtcd_jax.evaluation import make_evaluate, resample, search_budget
 from rtcd_jax.funnel import MARGIN
 from rtcd_jax.genome import decode
 from rtcd_jax.numerics.ellipsoid import Ellipsoids
@@ -81,9 +81,9 @@ def test_a_population_is_its_candidates_one_by_one():
 
 @pytest.mark.slow
 def test_a_resampled_funnel_is_about_the_same_policy():
-    """With the same effort and key it is the same funnel, with another key other levels but where a box ends them."""
+    """With the same budget and key it is the same funnel, with another key other levels but where a box ends them."""
     row = jax.tree.map(lambda leaf: leaf[pipeline.RTC], pipeline.evaluated())
-    again = jax.jit(partial(resample, pipeline.problem(), search_effort(pipeline.problem())))
+    again = jax.jit(partial(resample, pipeline.problem(), search_budget(pipeline.problem())))
     _assert_close(again(row, pipeline.GENERATION), row)
     other = again(row, jax.random.key(1))
     assert same(other.funnel.policy, row.funnel.policy)

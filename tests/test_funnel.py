@@ -12,12 +12,12 @@ import yaml
 
 from rtcd_jax import rollout
 from rtcd_jax.config import load as configuration
-from rtcd_jax.evaluation import elite_effort, make_evaluate, search_effort
+from rtcd_jax.evaluation import elite_budget, make_evaluate, search_budget
 from rtcd_jax.funnel import MARGIN, _crossings, _scan_knots, estimate_funnel
 from rtcd_jax.numerics.ellipsoid import half_widths
 from rtcd_jax.problem import make_problem
 from rtcd_jax.types import Status
-from rtcd_jax.validation import Dynamics, Effort
+from rtcd_jax.validation import Dynamics, Rollouts, SamplingBudget
 from rtcd_jax.volume import funnel_volume
 from tests import linear_system as linear
 from tests import pipeline
@@ -73,14 +73,14 @@ def test_rays_do_not_mix():
 # ---- a linear robot
 
 
-def _effort(problem, **changes) -> Effort:
+def _budget(problem, **changes) -> SamplingBudget:
     physics = rollout.closed_form(problem.plant)
-    effort = Effort(problem.config.funnel, Dynamics(physics, physics), rounds=0, follow=False)
-    return dataclasses.replace(effort, **changes)
+    budget = SamplingBudget(problem.config.funnel, Dynamics(physics, physics), rounds=0)
+    return dataclasses.replace(budget, **changes)
 
 
-def _estimator(problem, **effort):
-    estimate = partial(estimate_funnel, problem, linear.candidate(), effort=_effort(problem, **effort))
+def _estimator(problem, **budget):
+    estimate = partial(estimate_funnel, problem, linear.candidate(), budget=_budget(problem, **budget))
     return jax.jit(lambda policy: estimate(policy, jax.random.key(0)))
 
 
@@ -92,11 +92,11 @@ LARGEST = np.min(BOX**2 / np.diag(np.linalg.inv(linear.S)))
 
 @cache
 def _boxed():
-    return _estimator(linear.problem_of(BOX), rounds=3, follow=True)
+    return _estimator(linear.problem_of(BOX), rounds=3, samples_per_knot=64)
 
 
 def test_without_saturation_only_the_boxes_limit_a_resting_funnel():
-    """V falls from every state, so that each ellipsoid fills the boxes, and fresh states find nothing to shrink."""
+    """V falls from every state, so that each ellipsoid fills the boxes, and held-out samples find nothing to shrink."""
     funnel = _boxed()(RESTING)
     np.testing.assert_allclose(funnel.levels, (1 - MARGIN) * LARGEST, rtol=1e-9)
     assert np.all(funnel.trials == 64)
@@ -115,12 +115,9 @@ def _scanned(policy, last: float, directions: int):
 
     @jax.jit
     def scan(policy):
-        sets = linear.ellipsoids(policy)
-        tracked = rollout.reference(problem, linear.candidate(), policy, problem.config.funnel.steps)
-        boxes = sets.radii_inside(jnp.asarray(problem.state_limits))
-        return _scan_knots(
-            problem, linear.candidate(), sets, tracked, boxes, jnp.asarray(last), jax.random.key(0), _effort(problem)
-        )
+        rollouts = Rollouts.of(problem, linear.candidate(), policy, problem.config.funnel)
+        boxes = rollouts.sets.radii_inside(jnp.asarray(problem.state_limits))
+        return _scan_knots(rollouts, boxes, jnp.asarray(last), jax.random.key(0), _budget(problem))
 
     return np.asarray(scan(policy))
 
@@ -235,45 +232,45 @@ def test_without_limits_a_funnel_is_that_within_limits_that_never_bind(limits):
 # ---- the pendulum
 
 
-def _doubled(effort: Effort, part: str) -> Effort:
+def _doubled(budget: SamplingBudget, part: str) -> SamplingBudget:
     """Twice the directions, or half the rollouts' step, also at the goal."""
-    funnel, goal = effort.funnel, effort.funnel.goal
+    funnel, goal = budget.funnel, budget.funnel.goal
     if part == "directions":
         goal = goal.model_copy(update={"directions": 2 * goal.directions})
         changes = {"directions": 2 * funnel.directions, "goal": goal}
     else:
         changes = {"steps": 2 * funnel.steps, "goal": goal.model_copy(update={"step": goal.step / 2})}
-    return dataclasses.replace(effort, funnel=funnel.model_copy(update=changes))
+    return dataclasses.replace(budget, funnel=funnel.model_copy(update=changes))
 
 
-def _estimated(problem, evaluation, effort: Effort):
+def _estimated(problem, evaluation, budget: SamplingBudget):
     """Levels [P N+1] and total volumes [P] about an evaluation's policies."""
 
     @jax.jit
     @jax.vmap
     def estimate(candidate, policy):
-        funnel = estimate_funnel(problem, candidate, policy, pipeline.GENERATION, effort)
+        funnel = estimate_funnel(problem, candidate, policy, pipeline.GENERATION, budget)
         return funnel.levels, funnel_volume(funnel).total
 
     assert np.all(np.asarray(evaluation.status) == Status.OK)
     return tuple(np.asarray(leaf) for leaf in estimate(evaluation.candidate, evaluation.funnel.policy))
 
 
-def _known(effort: Effort):
+def _known(budget: SamplingBudget):
     """Of the paper's initial candidate and its published optima, about the policies of a generation."""
     known = np.array([pipeline.INITIAL, pipeline.RTC, pipeline.RTCD])
-    return _estimated(pipeline.problem(), jax.tree.map(lambda leaf: leaf[known], pipeline.evaluated()), effort)
+    return _estimated(pipeline.problem(), jax.tree.map(lambda leaf: leaf[known], pipeline.evaluated()), budget)
 
 
 @cache
 def _generations():
-    return _known(search_effort(pipeline.problem()))
+    return _known(search_budget(pipeline.problem()))
 
 
 @pytest.mark.slow
 def test_a_generations_levels_do_not_depend_on_the_rollouts_step():
     """Halved steps move none by 0.1 % (0.005 % measured)."""
-    for fine, coarse in zip(_known(_doubled(search_effort(pipeline.problem()), "steps")), _generations(), strict=True):
+    for fine, coarse in zip(_known(_doubled(search_budget(pipeline.problem()), "steps")), _generations(), strict=True):
         np.testing.assert_allclose(fine, coarse, rtol=1e-3)
 
 
@@ -288,15 +285,15 @@ def _assert_resolved(fine, coarse):
 
 
 def test_a_generations_levels_are_resolved():
-    _assert_resolved(_known(_doubled(search_effort(pipeline.problem()), "directions")), _generations())
+    _assert_resolved(_known(_doubled(search_budget(pipeline.problem()), "directions")), _generations())
 
 
 @pytest.mark.slow
 def test_the_elites_levels_are_resolved():
-    """Before fresh states shrink them; they are those of a generation, within 1 % (0.5 % measured)."""
-    effort = dataclasses.replace(elite_effort(pipeline.problem()), rounds=0, follow=False)
-    elites = _known(effort)
-    _assert_resolved(_known(_doubled(effort, "directions")), elites)
+    """Before held-out samples shrink them; they are those of a generation, within 1 % (0.5 % measured)."""
+    budget = dataclasses.replace(elite_budget(pipeline.problem()), rounds=0)
+    elites = _known(budget)
+    _assert_resolved(_known(_doubled(budget, "directions")), elites)
     np.testing.assert_allclose(elites[0], _generations()[0], rtol=0.01)
 
 
@@ -369,7 +366,7 @@ def _cartpoles():
 @cache
 def _cartpoles_levels():
     problem, evaluation = _cartpoles()
-    return _estimated(problem, evaluation, search_effort(problem))
+    return _estimated(problem, evaluation, search_budget(problem))
 
 
 @pytest.mark.slow
@@ -378,7 +375,7 @@ def test_cart_poles_are_resolved(part):
     """Doubled directions move no total by 1.5 % (0.6 % measured), no inlet's level by 10 % (4 %); halved steps none by
     1.5 % (3e-6) and 20 % (13 % for one, whose climbers go another way: 0.4 % for the others)."""
     problem, evaluation = _cartpoles()
-    levels, totals = _estimated(problem, evaluation, _doubled(search_effort(problem), part))
+    levels, totals = _estimated(problem, evaluation, _doubled(search_budget(problem), part))
     coarse_levels, coarse_totals = _cartpoles_levels()
     np.testing.assert_allclose(totals, coarse_totals, rtol=0.015)
     np.testing.assert_allclose(levels[:, 0], coarse_levels[:, 0], rtol=0.2 if part == "steps" else 0.1)

@@ -14,7 +14,7 @@ import yaml
 
 from rtcd_jax.analysis.disturb import scenarios
 from rtcd_jax.config import load as configuration
-from rtcd_jax.evaluation import elite_effort, make_evaluate, resample
+from rtcd_jax.evaluation import elite_budget, make_evaluate, resample
 from rtcd_jax.numerics.loops import compiled_for
 from rtcd_jax.problem import make_problem
 from rtcd_jax.search import cmaes
@@ -57,7 +57,7 @@ def test_a_generation_and_an_elite_ask_nothing_of_the_host(problem):
     assert "xla_python" not in program
     shapes = jax.eval_shape(lambda genomes, key: evaluate(genomes, wrapped(key)), genomes, key)
     one = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape[1:], leaf.dtype), shapes)
-    again = partial(resample, problem, elite_effort(problem))
+    again = partial(resample, problem, elite_budget(problem))
     assert calls(lowered(lambda evaluation, key: again(evaluation, wrapped(key)), one, key)) == set()
 
 

@@ -85,8 +85,8 @@ def _oracle_at_goal(x: np.ndarray, duration: float):
 
 @partial(jax.jit, static_argnames=("steps", "dynamics", "problem"))
 def _rolled(policy, x, steps, dynamics=CLOSED_FORM, problem=PROBLEM):
-    tracked = rollout.reference(problem, CANDIDATE, policy, steps)
-    return rollout.roll_intervals(problem, CANDIDATE, tracked, x, dynamics)
+    tracking = rollout.tracking_data(problem, CANDIDATE, policy, steps)
+    return rollout.roll_intervals(problem, CANDIDATE, tracking, x, dynamics)
 
 
 @partial(jax.jit, static_argnames=("dynamics", "duration", "step", "problem"))
@@ -253,8 +253,8 @@ def test_a_part_of_the_intervals_moves_as_in_the_whole():
 
     @jax.jit
     def rolled_part(x):
-        tracked = rollout.reference(PROBLEM, CANDIDATE, policy, 8).part(which)
-        return rollout.roll_intervals(PROBLEM, CANDIDATE, tracked, x, CLOSED_FORM)
+        tracking = rollout.tracking_data(PROBLEM, CANDIDATE, policy, 8).part(which)
+        return rollout.roll_intervals(PROBLEM, CANDIDATE, tracking, x, CLOSED_FORM)
 
     part, _ = rolled_part(x[:, which])
     np.testing.assert_allclose(part, whole[:, which], rtol=1e-13, atol=1e-14)

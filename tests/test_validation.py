@@ -1,4 +1,4 @@
-"""Fresh states are what they claim to be, and an inflated level does not survive them."""
+"""Held-out samples are what they claim to be, and an inflated level does not survive them."""
 
 import dataclasses
 from functools import partial
@@ -12,7 +12,16 @@ import scipy.stats
 
 from rtcd_jax import rollout
 from rtcd_jax.numerics.ellipsoid import Ellipsoids
-from rtcd_jax.validation import Dynamics, Effort, _fresh, _share, confirm, follow
+from rtcd_jax.validation import (
+    Dynamics,
+    Rollouts,
+    SamplingBudget,
+    _share,
+    _uniform,
+    compare_physics,
+    validate_intervals,
+    validate_paths,
+)
 from tests import linear_system as linear
 
 COUNT = 20_000
@@ -27,11 +36,11 @@ def _ellipsoids(n: int, knots: int = 3):
 
 
 @pytest.mark.parametrize("n", [1, 2, 4])
-def test_fresh_states_are_uniform_in_their_ellipsoids(n):
+def test_held_out_samples_are_uniform_in_their_ellipsoids(n):
     """V / rho of a uniform state is Beta(n/2, 1); its mean is the center, its covariance rho S^-1 / (n + 2)."""
     centers, values, sets = _ellipsoids(n)
     levels = np.array([0.2, 1.0, 3.0])
-    x = np.asarray(_fresh(sets, jnp.asarray(levels), jax.random.key(0), COUNT))
+    x = np.asarray(_uniform(sets, jnp.asarray(levels), jax.random.key(0), COUNT))
     assert x.shape == (n, 3, COUNT)
     share = np.asarray(sets.level(jnp.asarray(x))) / levels[:, None]
     for k in range(3):
@@ -45,7 +54,7 @@ def test_fresh_states_are_uniform_in_their_ellipsoids(n):
 def test_knots_rounds_and_keys_have_states_of_their_own():
     _, _, sets = _ellipsoids(2)
     same = Ellipsoids(*(jnp.broadcast_to(leaf[..., :1], leaf.shape) for leaf in sets))
-    x, again, other = (np.asarray(_fresh(same, jnp.ones(3), jax.random.key(seed), 50)) for seed in (0, 0, 1))
+    x, again, other = (np.asarray(_uniform(same, jnp.ones(3), jax.random.key(seed), 50)) for seed in (0, 0, 1))
     np.testing.assert_array_equal(x, again)
     assert len(np.unique(np.concatenate([x, other], 2)[0])) == 3 * 100
 
@@ -59,29 +68,30 @@ KNOWN = LAST * linear.decay(H) ** -np.arange(INTERVALS, -1.0, -1.0)
 """Without boxes and saturation: the least V that the loop carries beyond the next level."""
 
 
-def _effort(problem, rounds: int, follow: bool) -> Effort:
+def _budget(problem, rounds: int) -> SamplingBudget:
+    """Batches that end amid a knot's samples, and the last one amid itself."""
     physics = rollout.closed_form(problem.plant)
-    return Effort(problem.config.funnel, Dynamics(physics, physics), rounds=rounds, follow=follow)
+    return SamplingBudget(problem.config.funnel, Dynamics(physics, physics), rounds, TRIALS, batch=900)
+
+
+def _rollouts(problem) -> Rollouts:
+    return Rollouts.of(problem, linear.candidate(), POLICY, problem.config.funnel)
 
 
 PROBLEM = linear.problem_of([1e6, 1e6], intervals=INTERVALS, trials=TRIALS)
 
 
 def _program(verb: str, rounds: int, problem=PROBLEM):
-    effort = _effort(problem, rounds, follow=verb == "follow")
-    sets = linear.ellipsoids(POLICY)
+    validate = {"intervals": validate_intervals, "paths": validate_paths}[verb]
 
     @jax.jit
     def run(levels, key):
-        tracked = rollout.reference(problem, linear.candidate(), POLICY, effort.funnel.steps)
-        if verb == "confirm":
-            return confirm(problem, linear.candidate(), sets, tracked, levels, key, effort)
-        return follow(problem, linear.candidate(), POLICY, sets, tracked, levels, key, effort)
+        return validate(_rollouts(problem), levels, key, _budget(problem, rounds))
 
     return lambda levels, seed=0: jax.tree.map(np.asarray, run(jnp.asarray(levels), jax.random.key(seed)))
 
 
-@pytest.fixture(scope="module", params=["confirm", "follow"])
+@pytest.fixture(scope="module", params=["intervals", "paths"])
 def verb(request):
     return request.param
 
@@ -93,12 +103,14 @@ def patient(verb):
 
 @pytest.fixture(scope="module")
 def hasty(verb):
-    return _program(verb, rounds=1)
+    """One round; the paths' first stage, of a single state a knot, finds nothing."""
+    trials = 1 if verb == "paths" else TRIALS
+    return _program(verb, 1, linear.problem_of([1e6, 1e6], intervals=INTERVALS, trials=trials))
 
 
 def _tried(verb: str) -> np.ndarray:
     """The knots with trials when nothing fails: no interval starts at the last one, but there paths to the goal do."""
-    return np.array([TRIALS] * INTERVALS + [TRIALS if verb == "follow" else 0])
+    return np.array([TRIALS] * INTERVALS + [TRIALS if verb == "paths" else 0])
 
 
 def test_known_levels_stand(verb, patient):
@@ -136,12 +148,12 @@ def test_what_was_not_tried_has_no_trials(verb):
     np.testing.assert_array_equal(trials, 0)
 
 
-def test_the_confirmed_funnel_keeps_the_promise(verb, patient):
+def test_the_validated_funnel_keeps_the_promise(verb, patient):
     """Levels that are all twice too large: of a million other states of the result fewer fail than the bound says."""
     levels, trials = patient(2 * KNOWN)
     assert np.all(trials[:-1] == TRIALS)
     sets = linear.ellipsoids(POLICY)
-    x = _fresh(sets, jnp.asarray(levels), jax.random.key(99), 150_000)
+    x = _uniform(sets, jnp.asarray(levels), jax.random.key(99), 150_000)
     after = sets.part(slice(1, None)).level(jnp.einsum("ij,jkc->ikc", scipy.linalg.expm(linear.CLOSED * H), x[:, :-1]))
     rates = np.mean(np.asarray(after) > levels[1:, None], 1)
     assert np.all(rates <= 1 - 0.01 ** (1 / TRIALS))
@@ -155,7 +167,7 @@ def test_a_goal_level_that_saturates_is_found_out_by_paths_to_the_goal():
     limit = 1.0
     problem = linear.problem_of([1e6, 1e6], limit, intervals=INTERVALS, trials=TRIALS)
     lost = linear.S[0, 0] * (limit / 4) ** 2
-    levels, trials = _program("follow", 40, problem)(np.full(INTERVALS + 1, 1.5 * lost))
+    levels, trials = _program("paths", 40, problem)(np.full(INTERVALS + 1, 1.5 * lost))
     assert np.all(levels < lost)
     assert np.all(trials == TRIALS)
 
@@ -193,15 +205,56 @@ def test_a_share_with_other_dynamics_is_watched():
     problem = linear.problem_of([1e6, 1e6], intervals=INTERVALS, trials=TRIALS, mjx_share=0.5)
     motorless = rollout.Dynamics(lambda design, x, u: problem.plant.dynamics(design, x, 0 * u), large=False)
     physics = rollout.closed_form(problem.plant)
-    effort = dataclasses.replace(_effort(problem, 1, False), dynamics=Dynamics(physics, physics, motorless))
-    tracked = rollout.reference(problem, linear.candidate(), POLICY, effort.funnel.steps)
-    sets, levels = linear.ellipsoids(POLICY), jnp.asarray(0.999 * KNOWN)
-    shrunk, trials = jax.jit(partial(confirm, problem, linear.candidate(), sets, tracked, effort=effort))(
-        levels, jax.random.key(0)
-    )
+    budget = dataclasses.replace(_budget(problem, 1), dynamics=Dynamics(physics, physics, motorless))
+    levels = jnp.asarray(0.999 * KNOWN)
+    shrunk, trials = jax.jit(partial(validate_intervals, _rollouts(problem), budget=budget))(levels, jax.random.key(0))
     touched = np.asarray(
-        _share(jax.random.split(jax.random.fold_in(jax.random.key(0), 0))[1], INTERVALS, effort.funnel).knots
+        _share(jax.random.split(jax.random.fold_in(jax.random.key(0), 0))[1], INTERVALS, budget.funnel).knots
     )
     failed = np.flatnonzero(np.asarray(trials)[:-1] == 0)
     assert set(touched.tolist()) <= set(failed.tolist())
     assert np.all(np.asarray(shrunk)[touched] < np.asarray(levels)[touched])
+
+
+# ---- MJX beside the closed form
+
+
+STATES = 700
+
+
+def _compared(other: rollout.Dynamics, problem=PROBLEM, levels=0.999 * KNOWN):
+    program = jax.jit(partial(compare_physics, _rollouts(problem), states=STATES, mjx=other))
+    return jax.device_get(program(jnp.asarray(levels), jax.random.key(3)))
+
+
+def test_equal_physics_do_not_differ():
+    found = _compared(rollout.closed_form(PROBLEM.plant))
+    assert (found.states, found.failures, found.difference) == (STATES, 0, 0)
+
+
+def test_the_largest_difference_is_that_of_the_state_it_names():
+    """A force too large by one part in a thousand, on a problem whose motion is known: the same state, by expm."""
+    problem = linear.problem_of([1e6, 1e6], intervals=INTERVALS, steps=40)
+    stronger = rollout.Dynamics(lambda design, x, u: problem.plant.dynamics(design, x, 1.001 * u), large=False)
+    found = _compared(stronger, problem)
+    assert found.failures == 0
+    knots = found.time / H - found.knot
+    assert knots == pytest.approx(round(float(knots)), abs=1e-9)  # at a knot, before the horizon
+    other = linear.A - 1.001 * linear.B @ linear.K
+    ends = [scipy.linalg.expm(closed * H * knots) @ found.start for closed in (linear.CLOSED, other)]
+    np.testing.assert_allclose(found.closed_form, ends[0], rtol=1e-6, atol=1e-9)
+    np.testing.assert_allclose(found.mjx, ends[1], rtol=1e-6, atol=1e-9)
+    error = found.mjx - found.closed_form
+    level = 0.999 * KNOWN[found.knot + round(float(knots))]
+    assert found.difference == pytest.approx(np.sqrt(error @ linear.S @ error / level), rel=1e-6)
+    assert found.start @ linear.S @ found.start <= 0.999 * KNOWN[found.knot]
+
+
+def test_failures_under_other_physics_are_counted():
+    """Without a motor every state falls; one that is no number differs without limit."""
+    motorless = rollout.Dynamics(lambda design, x, u: PROBLEM.plant.dynamics(design, x, 0 * u), large=False)
+    assert _compared(motorless).failures > 0.9 * STATES
+    lost = rollout.Dynamics(lambda design, x, u: jnp.nan * x, large=False)
+    found = _compared(lost)
+    assert found.failures == STATES
+    assert found.difference == np.inf

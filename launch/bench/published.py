@@ -43,19 +43,17 @@ def main() -> None:
     robot = parser.parse_args().robot
     prepare_jax(1)
     from rtcd_jax.config.load import load
-    from rtcd_jax.evaluation import elite_effort, make_evaluate
-    from rtcd_jax.genome import encode, initial_genome
+    from rtcd_jax.evaluation import elite_budget, elite_key, make_evaluate
+    from rtcd_jax.genome import encode
     from rtcd_jax.problem import make_problem
-    from rtcd_jax.search import search
 
     config = off_the_rail(load(_config("cartpole"))) if robot == "off_the_rail" else load(_config(robot))
     problem = make_problem(config)
-    plan = search.Plan(config.search, config.elites, tuple(initial_genome(problem).tolist()), problem.design_dims)
-    evaluate = jax.jit(make_evaluate(problem, elite_effort(problem)))
+    evaluate = jax.jit(make_evaluate(problem, elite_budget(problem)))
     found = {}
     for name, values in CANDIDATES[robot].items():
         genome = jnp.asarray(encode(problem, values))
-        found[name] = jax.tree.map(lambda leaf: leaf[0], evaluate(genome[None], search.last_key(plan)))
+        found[name] = jax.tree.map(lambda leaf: leaf[0], evaluate(genome[None], elite_key()))
     print(f"{'volume (sampled)':16}" + "".join(f"{name:>24}" for name in found))
     for label, field in VOLUMES.items():
         values = [float(getattr(evaluation.volumes, field)) for evaluation in found.values()]

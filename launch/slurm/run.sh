@@ -10,11 +10,6 @@ set -uo pipefail
 
 trap : TERM   # this shell must outlive the signal, to requeue
 
-# Programs are compiled once, not at every start. The folder must be on a file system that all nodes share.
-export JAX_COMPILATION_CACHE_DIR="${JAX_COMPILATION_CACHE_DIR:-$PWD/.jax_cache}"
-export JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS=0
-export JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES=-1
-
 srun --kill-on-bad-exit=0 "${RTCD:-rtcd}" "$@"
 code=$?
 

@@ -15,6 +15,7 @@ class Machines:
 
     devices: Annotated[int | None, optional("INT", "devices to use of those each process sees [-]", "all")] = None
     cpu_devices: Annotated[int | None, optional("INT", "parts the CPU is split into [-]", "its cores")] = None
+    cache: Annotated[str | None, optional("DIR", "of compiled programs, '' for none", "~/.cache/rtcd_jax/xla")] = None
     coordinator: Annotated[str | None, optional("HOST:PORT", "where process 0 listens", _UNDER_SRUN)] = None
     num_processes: Annotated[int | None, optional("INT", "processes of this run [-]", _UNDER_SRUN)] = None
     process_id: Annotated[int | None, optional("INT", "this one's number, from 0 [-]", _UNDER_SRUN)] = None

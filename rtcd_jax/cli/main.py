@@ -35,11 +35,11 @@ def optimize(arguments: Sequence[str]) -> int:
 def sweep(arguments: Sequence[str]) -> int:
     """make all the runs that a YAML's sweep section asks for, or one of them"""
     from rtcd_jax.cli.search_options import read_sweep
-    from rtcd_jax.run.sweep import show
+    from rtcd_jax.run.sweep import show, store
 
     cases, options = read_sweep(arguments, RUNS)
     if options.list:
-        print(show(cases, options.folder))
+        print(show(cases))
         return Exit.OK
 
     def run(console, cluster) -> None:
@@ -54,7 +54,7 @@ def sweep(arguments: Sequence[str]) -> int:
             except UserError as error:  # the others may do better
                 console.message(f"case {case.number} ended early: {error}")
                 failed.append(case.folder.name)
-        cluster.on_first(lambda: console.message(show(cases, options.folder)))
+        cluster.on_first(lambda: console.message(f"{show(cases)}\n{store(cases, options.folder)}"))
         if failed:
             raise UserError(f"{len(failed)} of the cases ended early, see above: {', '.join(failed)}")
 
@@ -63,7 +63,7 @@ def sweep(arguments: Sequence[str]) -> int:
 
 def _on_cluster(machines: Any, folder: Path, run: Callable[[Any, Any], None]) -> int:
     """Joins the other processes of `machines`, if any, and runs `run(console, cluster)`; the exit code."""
-    prepare_jax(machines.cpu_devices)
+    prepare_jax(machines.cpu_devices, machines.cache)
     from rtcd_jax.system.cluster import Cluster, Lost, Preempted, join, part
 
     join(machines.coordinator, machines.num_processes, machines.process_id)  # before anything touches a device

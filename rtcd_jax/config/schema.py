@@ -237,16 +237,19 @@ class GoalConfig(Settings):
 
 
 class FunnelConfig(Settings):
-    rollouts: Literal["closed_form", "mjx", "mixed"] = Field(default="mixed", description="dynamics of the rollouts")
-    mjx_share: float = Field(default=0.01, ge=0, le=1, description="share of the fresh samples on MJX when mixed [-]")
-    directions: int = Field(default=12, ge=1, le=100_000, description="quasi-random directions at each knot [-]")
-    climbers: int = Field(
-        default=4, ge=2, le=10_000, description="directions led to the worst one, from knot to knot [-]"
+    rollouts: Literal["closed_form", "mjx", "mixed"] = Field(
+        default="closed_form",
+        description="dynamics of the search's rollouts; mixed: a share of the held-out samples on MJX",
     )
-    climbs: int = Field(default=3, ge=0, le=1000, description="steps towards it, at each knot [-]")
+    mjx_share: float = Field(
+        default=0.01, ge=0, le=1, description="share of the held-out samples on MJX when mixed [-]"
+    )
+    directions: int = Field(default=12, ge=1, le=100_000, description="quasi-random directions at each knot [-]")
+    climbers: int = Field(default=4, ge=2, le=10_000, description="adversarial directions, from knot to knot [-]")
+    climbs: int = Field(default=3, ge=0, le=1000, description="steps of each to a worse one, at each knot [-]")
     steps: int = Field(default=5, ge=1, le=1000, description="RK4 steps of a rollout inside an interval [-]")
     trials: int = Field(
-        default=32, ge=1, le=1_000_000, description="fresh uniform states of each ellipsoid, at each knot [-]"
+        default=32, ge=1, le=1_000_000, description="held-out samples, uniform in the ellipsoid, at each knot [-]"
     )
     confidence: float = Field(default=0.99, gt=0, lt=1, description="1 - beta, jointly over the knots [-]")
     goal: GoalConfig = Field(default=GoalConfig(), description="region of attraction of the goal's LQR")
@@ -311,10 +314,22 @@ class ElitesConfig(Settings):
         default=0.02, ge=0, lt=1, description="smallest distance between two of them in the unit box [-]"
     )
     trials: int = Field(
-        default=2000, ge=1, le=100_000_000, description="fresh states at each knot of their evaluation [-]"
+        default=24_000, ge=1, le=100_000_000, description="held-out samples at each knot, followed to the goal [-]"
     )
     directions: int = Field(
-        default=192, ge=1, le=1_000_000, description="fresh directions at each knot of their evaluation [-]"
+        default=192, ge=1, le=1_000_000, description="directions at each knot of their evaluation [-]"
+    )
+    mjx_states: int = Field(
+        default=2000,
+        ge=0,
+        le=100_000_000,
+        description="held-out samples of each that MJX follows to the goal as well; 0: none [-]",
+    )
+    keys: int = Field(
+        default=5,
+        ge=0,
+        le=1000,
+        description="further keys under which best and initial are evaluated, for the spread; 0: none [-]",
     )
 
 

@@ -27,7 +27,7 @@ LEVEL_TOLERANCE = 1e-6
 ARRIVED = 1e-3
 """Share of the last level below which a state counts as arrived at the end of the settling time."""
 FORGOTTEN = 0.1
-"""Share of that below which a settling state is followed no further."""
+"""Share of that below which a settling state is not simulated any more."""
 SETTLING = 15.0
 """Settling time in time constants of the slowest mode about the goal."""
 
@@ -205,9 +205,9 @@ def dormand_prince(f: Dynamics, longest_step: float, relative: float, absolute: 
 
         solver = RK45(slope, start, x.ravel(), end, longest_step, rtol=relative * share, atol=absolute * share)
         while solver.status == "running":
-            trouble = solver.step()
-            if trouble:
-                raise RuntimeError(f"RK45 stopped at t = {solver.t:g} s: {trouble}")
+            failure = solver.step()
+            if failure:
+                raise RuntimeError(f"RK45 stopped at t = {solver.t:g} s: {failure}")
             yield solver.y.reshape(x.shape)
 
     return march

@@ -91,8 +91,8 @@ class Elite:
         """
         _require_kinds(record)
         promise = {"epsilon": 0.0, "confidence": 1.0} if record.get("rung") == CLAIMED else {}
-        told = {name: record.get(name, promise.get(name)) for name in ("plant", "parameters", "epsilon", "confidence")}
-        told["guarantee"] = record.get("rung")
+        named = {name: record.get(name, promise.get(name)) for name in ("plant", "parameters", "epsilon", "confidence")}
+        named["guarantee"] = record.get("rung")
         numbers = {name: np.asarray(arrays[name], float) for name in arrays.keys() & cls.__dataclass_fields__.keys()}
         limits = record.get("state_limits")
         if limits is not None:
@@ -102,7 +102,7 @@ class Elite:
             for name, array in arrays.items()
             if name.startswith("volumes_") and not array.ndim
         }
-        fields: dict[str, Any] = {**told, **numbers, "volumes": volumes, "record": record}
+        fields: dict[str, Any] = {**named, **numbers, "volumes": volumes, "record": record}
         stored = {"guarantee": "rung"}  # the field's key in NNN.json
         missing = [stored.get(name, name) for name in cls.__dataclass_fields__ if fields.get(name) is None]
         if missing:

@@ -106,13 +106,13 @@ def read_generations(path: Path) -> list[dict[str, Any]]:
     Raises UserError, with the line, if another one is damaged.
     """
     lines = path / "generations.jsonl"
-    found = []
+    generations = []
     with reading(lines, _RESTORE), lines.open("rb") as file:
         for number, line in enumerate(file, 1):
             if line.endswith(b"\n"):
                 with reading(Path(f"{lines}, line {number}"), _RESTORE):
-                    found.append(dict(json.loads(line)))
-    return found
+                    generations.append(dict(json.loads(line)))
+    return generations
 
 
 def require_format(path: Path) -> None:

@@ -9,7 +9,8 @@ import io
 import json
 import os
 import re
-from collections.abc import Iterator, Mapping, Sequence
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -17,11 +18,12 @@ import jax
 import numpy as np
 import yaml
 
+from rtcd_jax.certificate.standing import certificate_path
 from rtcd_jax.elite.records import elite_name
 from rtcd_jax.export import robot, source, tables
-from rtcd_jax.export.bundle import Bundle, certificate_path, read_bundle
-from rtcd_jax.system.console import Console
-from rtcd_jax.system.errors import UserError
+from rtcd_jax.export.bundle import Bundle, read_bundle
+from rtcd_jax.system.console import Console, Progress
+from rtcd_jax.system.errors import UserError, printable
 from rtcd_jax.system.files import is_temporary, plain, replace, replace_json, writing
 
 FORMAT = "rtcd_jax export"
@@ -39,7 +41,7 @@ def export_run(folder: Path, elite: int | str, target: Path, console: Console, l
         UserError: no run folder, no such elite, one without a funnel, or a target that holds something else.
     """
     former = _former(target)
-    bundle = read_bundle(folder, elite_name(elite), label)
+    bundle = read_bundle(folder, elite_name(elite), label, _telling(console))
     contents = _files(folder, bundle)
     _require_ours(target, former, contents)
     digests = {file: _digest(content) for file, content in contents.items()}
@@ -56,6 +58,19 @@ def export_run(folder: Path, elite: int | str, target: Path, console: Console, l
     _mark(target, bundle, complete=True, files=digests)
     for line in _summary(bundle, target, bool(former), kept):
         console.message(line)
+
+
+def _telling(console: Console) -> Callable[[int, int, str], None]:
+    """What says every second how far a long step is."""
+    told = time.monotonic()
+
+    def tell(done: int, of: int, what: str) -> None:
+        nonlocal told
+        if time.monotonic() - told >= 1:
+            told = time.monotonic()
+            console.progress(Progress(done, of, f"{what}  {done}/{of}"))
+
+    return tell
 
 
 def _former(target: Path) -> dict[str, str]:
@@ -119,7 +134,7 @@ def _mark(target: Path, bundle: Bundle, complete: bool, files: Mapping[str, str]
         "name": bundle.label,
         "plant": bundle.elite.plant,
         "elite": bundle.name,
-        "claim": bundle.proof.claim or None,
+        "claim": bundle.standing.claim if bundle.proof else None,
     }
     replace_json(target / MARK, {"format": FORMAT, "version": VERSION, "complete": complete, **about, "files": files})
 
@@ -143,7 +158,7 @@ def _files(folder: Path, bundle: Bundle) -> dict[str, bytes]:
     np.savez(archive, **bundle.arrays())  # type: ignore[arg-type]
     contents = {name: text.encode() for name, text in texts.items()}
     contents[f"{bundle.label}_controller.npz"] = archive.getvalue()
-    if bundle.certificate:
+    if bundle.proof:
         contents["certificate.json"] = certificate_path(folder, bundle.name).read_bytes()
     return contents
 
@@ -166,13 +181,16 @@ def _parameters(bundle: Bundle, described: Mapping[str, Any]) -> str:
 
 
 def _summary(bundle: Bundle, target: Path, again: bool, kept: Sequence[str]) -> Iterator[str]:
-    plant, rung, certificate = bundle.elite.plant, bundle.elite.guarantee, bundle.certificate
-    verb = "replaces the former export" if again else "is"
-    yield f"{plant}, elite {bundle.name} with its {rung} funnel, {verb} in {target}"
-    if certificate:
-        yield f"certificate: rung {certificate['rung'] or 'unknown'}, in {target / 'certificate.json'}"
-    else:
+    verb, found = "replaces the former export" if again else "is", bundle.standing
+    yield f"{bundle.elite.plant}, elite {bundle.name}, {verb} in {target}; its monitor's funnel is {bundle.guarantee}"
+    if bundle.proof:
+        where = target / "certificate.json"
+        yield f"certificate: proved from {found.start:.6g} s on, in {where}; claim: sha256 {found.claim}"
+    elif found.verdict == "missing":
         yield "certificate: none; `rtcd certify` proves the funnel"
+    else:
+        yield f"certificate: {found.verdict}, so it does not go along: {printable(found.reason)}"
+    yield f"control rate: {bundle.control_rate.sentence}"
     if kept:
         yield f"left where they are, for they were changed since the former export: {', '.join(kept)}"
     yield f"test it: python {target / f'{bundle.label}_controller.py'}"

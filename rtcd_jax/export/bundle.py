@@ -1,10 +1,7 @@
 """One stored elite as the controller that a lab runs: every number it looks up, and what the numbers mean."""
 
-import hashlib
-import json
-import math
 import re
-from collections.abc import Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple, final
@@ -13,21 +10,18 @@ import jax
 import numpy as np
 from jaxtyping import Int
 
-from rtcd_jax.elite.closed_loop import fastest_rate
+from rtcd_jax.certificate.standing import Standing, certificate_path, standing
 from rtcd_jax.elite.elite import Elite, ellipsoid_axes
 from rtcd_jax.elite.funnel import FunnelInterpolant
 from rtcd_jax.export.proof import ProvedFunnel
+from rtcd_jax.export.rate import ControlRate, control_rate
 from rtcd_jax.plants import plant_class
 from rtcd_jax.plants.base import Plant
-from rtcd_jax.plants.mjx import CpuDynamics, model_of
+from rtcd_jax.plants.mjx import model_of
 from rtcd_jax.system.errors import UserError
 
-HOLD = 0.1
-"""Longest time for which the input may be held, in time constants of the loop's fastest mode."""
-RULE = f"the input is held for at most {HOLD:g} time constants of the loop's fastest mode"
-BETWEEN_KNOTS = "V = (x - x*)'S(t)(x - x*), S cubic Hermite, log rho linear; what was sampled is promised at knots"
-RATES = 50.0
-"""Control rates are multiples of this [Hz]."""
+SAMPLED = "V = (x - x*)'S(t)(x - x*) <= rho(t), S cubic Hermite, log rho linear; what was sampled is promised at knots"
+PROVED = "|L(t)^-1 (x - x*(t))| <= 1 with the certificate's L, from its start on and after t_N; before it as sampled"
 
 
 class Instant(NamedTuple):
@@ -51,16 +45,27 @@ class Bundle:
     name: str
     label: str
     funnel: FunnelInterpolant
-    certificate: Mapping[str, Any] | None
     plant: Plant
     design: Any
     model: Any
     joints: Int[np.ndarray, " m"]
-    proof: ProvedFunnel
+    standing: Standing
+    proof: ProvedFunnel | None
+    control_rate: ControlRate
 
     @property
     def elite(self) -> Elite:
         return self.funnel.elite
+
+    @property
+    def guarantee(self) -> str:
+        """Of the funnel that the monitor evaluates."""
+        return "proved" if self.proof else self.elite.guarantee
+
+    @property
+    def rates(self) -> np.ndarray:
+        """x*' at both ends of every interval: the certificate's, which are the elite's to their rounding."""
+        return self.proof.rates if self.proof else self.funnel.loop.rates
 
     def at(self, t: float) -> Instant:
         """The loop at a time t >= 0: u* held, K linear, x* and the funnel's axes; the goal's from t_N on."""
@@ -68,7 +73,7 @@ class Bundle:
         x, after = funnel.nominal(now)[0], t >= elite.time[-1]
         k = len(elite.u) if after else min(int(t / dt), len(elite.u) - 1)
         s = 0.0 if after else t / dt - k
-        proved = self.proof.at(k + s)
+        proved = self.proof.at(k + s) if self.proof else None
         axes = ellipsoid_axes(funnel.value(now), funnel.level(now))[0] if proved is None else proved
         if after:
             return Instant(x, np.zeros_like(elite.u_max), elite.K_goal, axes, proved is not None)
@@ -78,8 +83,10 @@ class Bundle:
         """What the controller's npz holds, SI units."""
         elite = self.elite
         kept = {name: getattr(elite, name) for name in ("time", "x", "u", "K", "S", "rho", "K_goal", "x_goal", "u_max")}
-        more = {"x_rates": self.funnel.loop.rates, "S_rates": self.funnel.value_rates}
-        proof = {"proof_begins": self.proof.begins, "proof_axes": self.proof.axes}
+        more = {"x_rates": self.rates, "S_rates": self.funnel.value_rates}
+        nothing = np.zeros(0), np.zeros((0, 4, *elite.S.shape[1:]))
+        begins, axes = (self.proof.begins, self.proof.axes) if self.proof else nothing
+        proof = {"proof_begins": begins, "proof_axes": axes}
         return kept | more | {"state_limits": elite.state_limits, "input_joints": self.joints} | proof
 
     def describe(self) -> dict[str, Any]:
@@ -103,39 +110,72 @@ class Bundle:
             ],
             "convention": self.plant.convention,
             "time": {"unit": "s", "knots": elite.time.size, "dt": elite.time[1], "duration": elite.time[-1]},
-            "control_rate": {"unit": "Hz", "least": least_rate(self), "rule": RULE},
+            "control_rate": {
+                "unit": "Hz",
+                "least": self.control_rate.rate,
+                "period": self.control_rate.period,
+                "calls_an_interval": self.control_rate.divisor,
+                "states": self.control_rate.states,
+                "rule": self.control_rate.sentence,
+            },
+            "monitor": {"guarantee": self.guarantee, "set": PROVED if self.proof else SAMPLED},
             "funnel": {
                 "rung": elite.guarantee,
                 "epsilon": elite.epsilon,
                 "confidence": elite.confidence,
                 "volumes": record["volumes"],
                 "volume_unit": record["units"]["volume"],
-                "between_knots": BETWEEN_KNOTS,
+                "between_knots": SAMPLED,
             },
-            "certificate": self.certificate,
+            "certificate": self._certificate(),
+        }
+
+    def _certificate(self) -> dict[str, Any] | None:
+        """The certificate that goes along, if it proves this elite."""
+        if self.proof is None:
+            return None
+        return {
+            "file": "certificate.json",
+            "sha256": self.standing.sha256,
+            "claim": self.standing.claim,
+            "rung": "proved",
+            "from": self.standing.start,
+            "volumes": self.standing.volumes,
+            "check": "rtcd check certificate.json",
         }
 
 
-def read_bundle(folder: Path, name: str, label: str | None = None) -> Bundle:
+def read_bundle(
+    folder: Path,
+    name: str,
+    label: str | None = None,
+    tell: Callable[[int, int, str], None] = lambda done, of, what: None,
+) -> Bundle:
     """The elite `name` ("000", ... or "initial") of a run folder, to be exported as `label`, by default PLANT_NAME.
+
+    `tell(done, of, what)` is told how far a long step is.
 
     Raises:
         UserError: it is not there, cannot be read or has no funnel; a label that is no name in Python and C.
     """
     elite = Elite.read(folder, name)
+    label = _label(label or f"{elite.plant}_{name}")
+    found = standing(folder, name, lambda done, of: tell(done, of, "checking the certificate"))
+    proof = ProvedFunnel.read(certificate_path(folder, name)) if found.proved else None
     with jax.enable_x64(True):
         plant, design = plant_class(elite.plant).from_parameters(elite.parameters)
     model = model_of(elite.plant, elite.parameters)
     return Bundle(
         name=name,
-        label=_label(label or f"{elite.plant}_{name}"),
+        label=label,
         funnel=FunnelInterpolant.of(elite),
-        certificate=_certificate(folder, name, elite),
         plant=plant,
         design=design,
         model=model,
         joints=model.actuator_trnid[:, 0].copy(),
-        proof=ProvedFunnel.none(elite.x_goal.size),
+        standing=found,
+        proof=proof,
+        control_rate=control_rate(elite, proof, lambda done, of: tell(done, of, "trying control rates")),
     )
 
 
@@ -144,45 +184,3 @@ def _label(text: str) -> str:
     if not re.fullmatch(r"[A-Za-z][A-Za-z0-9_]{0,63}", text):
         raise UserError(f"name {text!r}: must be a letter and up to 63 letters, digits and _, as pendulum_000")
     return text
-
-
-def least_rate(bundle: Bundle) -> float:
-    """A control rate [Hz] at which holding the input is a small matter: `HOLD` of the fastest mode's time constant."""
-    columns = bundle.elite.x_goal.size + bundle.elite.u_max.size
-    fastest = fastest_rate(bundle.elite, CpuDynamics(bundle.model, columns))
-    return RATES * math.ceil(fastest / HOLD / RATES)
-
-
-def certificate_path(folder: Path, name: str) -> Path:
-    """Where a run folder keeps the certificate of an elite."""
-    return folder / "certificates" / f"{name}.json"
-
-
-def _certificate(folder: Path, name: str, elite: Elite) -> dict[str, Any] | None:
-    """File, digest and rung of the elite's certificate; None if the run has none for this very controller."""
-    path = certificate_path(folder, name)
-    if not path.is_file():
-        return None
-    try:
-        content = path.read_bytes()
-        claim = json.loads(content)["claim"]
-        same = all(np.array_equal(_exact(claim[key]), getattr(elite, key).ravel()) for key in ("x", "u", "K", "K_goal"))
-        summary_path = path.with_name("summary.json")
-        summary = json.loads(summary_path.read_bytes()) if summary_path.is_file() else {}
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise UserError(f"cannot read {path}: {error!r}; prove it again by `rtcd certify {folder}`") from error
-    if not same:
-        return None
-    shown = summary.get(name) or {}
-    return {
-        "file": "certificate.json",
-        "sha256": hashlib.sha256(content).hexdigest(),
-        "rung": shown.get("rung"),
-        "from": shown.get("start"),
-        "check": "rtcd check certificate.json",
-    }
-
-
-def _exact(rows: Any) -> np.ndarray:
-    """A certificate's hexadecimal doubles as numbers, row by row."""
-    return np.array([float.fromhex(number) for number in np.ravel(rows).tolist()])

@@ -1,29 +1,44 @@
 """The funnel that an elite's certificate proves, as the exported monitors evaluate it."""
 
 from dataclasses import dataclass
-from typing import final
+from pathlib import Path
+from typing import Any, final
 
 import numpy as np
 from jaxtyping import Float
+
+from rtcd_jax.certificate.check import Node, parse, read_claim, read_stretch
+from rtcd_jax.certificate.check.file import read_goal
 
 
 @final
 @dataclass(frozen=True, eq=False)
 class ProvedFunnel:
-    """E(t) = {x*(t) + L(t) y : |y| <= 1} of a certificate; without pieces nothing is proved.
+    """E(t) = {x*(t) + L(t) y : |y| <= 1} of a certificate.
 
     Piece i begins at `begins`[i], in knots, and L = sum_j `axes`[i, j] s^j there, with s from -1 to 1 until the next
-    one begins. The last piece is the goal's region, for all time. `claim` is the SHA-256 of the certificate's claim.
+    one begins. The last piece is the goal's region, for all time. `rates` are x*' at both ends of every interval.
     """
 
     begins: Float[np.ndarray, " pieces"]
     axes: Float[np.ndarray, "pieces 4 n n"]
-    claim: str = ""
+    rates: Float[np.ndarray, "intervals 2 n"]
 
     @classmethod
-    def none(cls, n: int) -> "ProvedFunnel":
-        """Where there is no certificate, of a robot with n states."""
-        return cls(np.zeros(0), np.zeros((0, 4, n, n)))
+    def read(cls, path: Path) -> "ProvedFunnel":
+        """Of a certificate that the checker accepts, its exact numbers rounded."""
+        content = parse(path.read_bytes())
+        claim = read_claim(Node("claim", content["claim"]))
+        stretches = [read_stretch(Node("funnel", stretch), claim) for stretch in content["funnel"]]
+        begins, axes = [], []
+        for stretch in stretches:
+            begins.append(float(stretch.knot + stretch.start))
+            first, last, (bend_0, bend_1) = map(_floats, (stretch.first, stretch.last, stretch.bend))
+            axes.append([(first + last) / 2 + bend_0, (last - first) / 2 + bend_1, -bend_0, -bend_1])
+        goal = _floats(read_goal(Node("goal", content["goal"]), claim)[0])
+        begins.append(float(len(claim.u)))
+        axes.append([goal, 0 * goal, 0 * goal, 0 * goal])
+        return cls(np.array(begins), np.array(axes), _floats(claim.rates))
 
     def at(self, knots: float) -> Float[np.ndarray, "n n"] | None:
         """L at a time in knots; None before the proof begins."""
@@ -35,3 +50,8 @@ class ProvedFunnel:
         begin, end = self.begins[piece : piece + 2]
         s = (2 * knots - begin - end) / (end - begin)
         return np.einsum("j,jkl->kl", s ** np.arange(4), self.axes[piece])
+
+
+def _floats(values: Any) -> np.ndarray:
+    """Exact numbers, nested, as doubles."""
+    return np.array(values, dtype=object).astype(float)

@@ -1,6 +1,6 @@
 """The C controller's numbers as headers, and the text of the folder's README."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from importlib.resources import files
 from string import Template
 from typing import Any
@@ -30,9 +30,9 @@ def named(text: str, bundle: Bundle) -> str:
 
 def _with_claim(name: str, bundle: Bundle) -> str:
     text = _template(PREFIX + name)
-    if bundle.proof.claim and name in _CLAIMS:
+    if bundle.proof and name in _CLAIMS:
         empty = _CLAIMS[name]
-        text = text.replace(empty, empty[:-1] + bundle.proof.claim + '"')
+        text = text.replace(empty, empty[:-1] + bundle.standing.claim + '"')
     return text
 
 
@@ -57,10 +57,10 @@ def _size_header(bundle: Bundle) -> str:
 
 def _data_header(bundle: Bundle) -> str:
     """Every number that the controller and the monitor look up."""
-    elite, begins = bundle.elite, bundle.proof.begins
+    elite, proof = bundle.elite, bundle.proof
     arrays = {
         "X": elite.x,
-        "X_RATES": bundle.funnel.loop.rates,
+        "X_RATES": bundle.rates,
         "U": elite.u,
         "K": elite.K,
         "S": elite.S,
@@ -71,24 +71,19 @@ def _data_header(bundle: Bundle) -> str:
         "U_MAX": elite.u_max,
         "STATE_LIMITS": elite.state_limits,
     }
-    if begins.size:
-        arrays |= {"PROOF_BEGINS": begins, "PROOF_AXES": bundle.proof.axes}
+    if proof:
+        arrays |= {"PROOF_BEGINS": proof.begins, "PROOF_AXES": proof.axes}
     scalars = [
         f"#define RTCD_DT {_number(elite.time[1])}",
         f"#define RTCD_DURATION {_number(elite.time[-1])}",
-        f"#define RTCD_PIECES {begins.size}",
+        f"#define RTCD_PIECES {proof.begins.size if proof else 0}",
     ]
     return _header(bundle, "RTCD_CONTROLLER_DATA_H", [*scalars, *_definitions(arrays)])
 
 
 def readme(bundle: Bundle, described: dict[str, Any]) -> str:
     """The folder's README: what lies where, which way the axes point, what is promised."""
-    funnel, certificate = described["funnel"], described["certificate"]
-    proof = (
-        f"`certificate.json` is its certificate (rung {certificate['rung'] or 'unknown'}); `rtcd check` checks it."
-        if certificate
-        else "It has no certificate."
-    )
+    funnel = described["funnel"]
     quantities = [*described["states"], *described["inputs"]]
     rows = [f"| {item['name']} | {item['unit']} | {_limit(item['limit'])} |" for item in quantities]
     design = ", ".join(
@@ -102,14 +97,31 @@ def readme(bundle: Bundle, described: dict[str, Any]) -> str:
         convention=bundle.plant.convention,
         quantities="\n".join(rows),
         duration=f"{bundle.elite.time[-1]:.6g}",
-        rate=f"{described['control_rate']['least']:g}",
+        rate=bundle.control_rate.sentence,
         rung=funnel["rung"],
-        epsilon=f"{funnel['epsilon']:.2g}",
-        confidence=f"{funnel['confidence']:g}",
-        inlet=f"{funnel['volumes']['inlet']:.4g} {funnel['volume_unit']}",
-        proof=proof,
+        promise=_promise(bundle, funnel),
         columns="`time,pos,vel,torque`" if bundle.elite.x_goal.size == 2 else "`time,pos1,…,vel1,…,tau1,…,K11,…`",
     )
+
+
+def _promise(bundle: Bundle, funnel: Mapping[str, Any]) -> str:
+    """What is promised of the funnels, and on what ground."""
+    unit, found = funnel["volume_unit"], bundle.standing
+    inlet, at_most = f"{funnel['volumes']['inlet']:.4g} {unit}", f"{funnel['epsilon']:.2g}"
+    sampled = f"""\
+The funnel of `funnel.csv` is {funnel["rung"]}: in simulation a state drawn uniformly from a knot's ellipsoid (the
+first one has {inlet}) failed to arrive with a probability of at most {at_most}, at confidence
+{funnel["confidence"]:g} jointly for all knots."""
+    if bundle.proof is None:
+        return f"{sampled} The monitor evaluates it. Nothing is proved: the certificate is {found.verdict}."
+    return f"""\
+The monitor evaluates the **proved** funnel from {found.start:.6g} s on: every motion of the model that is inside at
+some time stays inside and comes to the goal, in continuous time, within the limits. Its first ellipsoid has
+{found.volumes["inlet"]:.4g} {unit}. `certificate.json` is the proof, and `rtcd check certificate.json` checks it. The
+SHA-256 of its claim about this controller stands in the controllers, too:
+`{found.claim}`.
+
+{sampled}"""
 
 
 def _header(bundle: Bundle, guard: str, lines: list[str]) -> str:

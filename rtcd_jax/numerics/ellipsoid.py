@@ -55,8 +55,11 @@ class Ellipsoids(NamedTuple):
 
     def level(self, x):
         """V(x) [K ...] of x [n K ...]."""
-        error = x - _behind(self.centers, x.ndim - 2)
-        return jnp.sum(error * mv(_behind(self.values, x.ndim - 2), error), 0)
+        return self.value_of_error(x - _behind(self.centers, x.ndim - 2))
+
+    def value_of_error(self, error):
+        """V(center + error) [K ...] of errors [n K ...]."""
+        return jnp.sum(error * mv(_behind(self.values, error.ndim - 2), error), 0)
 
     def radii_inside(self, limits):
         """The largest sqrt(rho) [K] for which |x_i| <= limits_i everywhere in the set; 0 if not even the center is."""

@@ -1,11 +1,20 @@
-"""Confidence in a proportion seen in independent trials."""
+"""Confidence in a proportion seen in independent trials (Clopper and Pearson, Biometrika 26, 1934)."""
 
-import jax.numpy as jnp
+import math
+
+from scipy.special import betaincinv
 
 
-def failure_bound(trials, doubt):
-    """Largest failure probability that `trials` trials without a failure leave possible at confidence 1 - doubt.
+def clopper_pearson(failures: int, trials: int, confidence: float) -> tuple[float, float]:
+    """Exact lower and upper bounds of a probability, each of which holds with `confidence` (one-sided)."""
+    lower = betaincinv(failures, trials - failures + 1, 1 - confidence) if failures else 0.0
+    upper = betaincinv(failures + 1, trials - failures, confidence) if failures < trials else 1.0
+    return float(lower), float(upper)
 
-    The exact (Clopper-Pearson) bound 1 - doubt^(1/trials); 1 for no trials.
+
+def failure_bound(trials: int, doubt: float) -> float:
+    """The upper bound for `trials` trials without a failure, at confidence 1 - doubt: 1 - doubt^(1/trials).
+
+    1 for no trials. Unlike the general bound it keeps its digits for a small `doubt`.
     """
-    return -jnp.expm1(jnp.log(doubt) / jnp.maximum(trials, 1e-300))
+    return -math.expm1(math.log(doubt) / trials) if trials else 1.0

@@ -66,8 +66,13 @@ class RunFolder:
     Every method raises UserError, naming the path, where the folder cannot be written.
     """
 
-    def __init__(self, path: Path, seconds: float, cluster: "Cluster", checkpointer: Any, held: contextlib.ExitStack):
+    def __init__(
+        self, path: Path, seconds: float, cluster: "Cluster", checkpointer: Any, held: contextlib.ExitStack,
+        notes: list[str],
+    ):  # fmt: skip
         self.path = path
+        self.notes = notes
+        """What was damaged and is mended, for the user to read."""
         self._seconds = seconds
         self._cluster = cluster
         self._checkpointer = checkpointer
@@ -88,10 +93,11 @@ class RunFolder:
 
             cluster = Cluster.of()
         cluster.require_alike("configuration", configuration.config_hash(config))
+        notes: list[str] = []
         with contextlib.ExitStack() as stack:
-            cluster.on_first(lambda: stack.enter_context(_prepared(path, config)))
+            cluster.on_first(lambda: stack.enter_context(_prepared(path, config, notes)))
             checkpointer = stack.enter_context(_checkpoints(path / "state"))
-            return cls(path, config.checkpoint.seconds, cluster, checkpointer, stack.pop_all())
+            return cls(path, config.checkpoint.seconds, cluster, checkpointer, stack.pop_all(), notes)
 
     def __enter__(self) -> Self:
         return self
@@ -114,12 +120,45 @@ class RunFolder:
     def restore(self, state: State) -> State:
         """The latest saved state, or `state` if there is none; later lines of generations.jsonl are cut off.
 
-        `state` is that of a search that has not begun: its arrays say the shapes. Raises UserError if the saved one
-        has others, or if lines are missing.
+        Where that state is damaged, or lines up to it are missing, the one before is taken; the later ones are moved
+        into `state.damaged`. `state` is that of a search that has not begun: its arrays say the shapes. Raises
+        UserError, and moves nothing, if no saved state fits them and the lines.
         """
-        latest = self._checkpointer.latest
-        self._cluster.on_first(lambda: self._cut(latest.step if latest else 0))
-        return _load(self._checkpointer, self._cluster.replicated(state)) if latest else state
+        saved = sorted(self._checkpointer.checkpoints, key=lambda each: each.step, reverse=True)
+        lines = int(self._cluster.agreed(np.asarray(len(_lines(self._lines_path)) if self._cluster.first else 0)))
+        shapes, errors = self._cluster.replicated(state), []
+        for index, checkpoint in enumerate(saved):
+            try:
+                if lines < checkpoint.step:
+                    raise UserError(
+                        f"{self._lines_path} has {lines} complete lines, but {self._state_path} is of generation "
+                        f"{checkpoint.step}: the folder was changed by hand; choose another one"
+                    )
+                loaded = _load(self._checkpointer, checkpoint, shapes)
+            except UserError as error:
+                errors.append(error)
+                continue
+            if index:
+                self._cluster.on_first(lambda damaged=saved[:index]: self._set_aside(damaged))
+                self._checkpointer.reload()
+                self.notes.append(f"{errors[0]}; going on with the state of generation {checkpoint.step}")
+            self._cluster.on_first(lambda step=checkpoint.step: self._cut(step))
+            return loaded
+        if errors:
+            raise errors[0]
+        self._cluster.on_first(lambda: self._cut(0))
+        return state
+
+    def _set_aside(self, checkpoints: Iterable[Any]) -> None:
+        folder = self.path / "state.damaged"
+        with writing(folder):
+            folder.mkdir(exist_ok=True)
+            for checkpoint in checkpoints:
+                place = folder / f"{checkpoint.step}"
+                number = itertools.count(1)
+                while place.exists():
+                    place = folder / f"{checkpoint.step}.{next(number)}"
+                (self._state_path / f"{checkpoint.step}").rename(place)
 
     def append(self, record: Record) -> None:
         """Adds a generation to generations.jsonl."""
@@ -176,20 +215,29 @@ class RunFolder:
                 (folder / f"{name}.npz").unlink(missing_ok=True)
 
     def _cut(self, generations: int) -> None:
-        with self._lines_path.open("rb") as file:
-            complete = [len(line) for line in itertools.islice(file, generations) if line.endswith(b"\n")]
-        if len(complete) < generations:
-            raise UserError(
-                f"{self._lines_path} has {len(complete)} complete lines, but {self._state_path} is of generation "
-                f"{generations}: the folder was changed by hand; choose another one"
-            )
         with writing(self._lines_path):
-            os.truncate(self._lines_path, sum(complete))
+            os.truncate(self._lines_path, sum(_lines(self._lines_path)[:generations]))
+
+
+def _lines(path: Path) -> list[int]:
+    """Lengths of the file's lines before the first that is torn or damaged."""
+    whole = []
+    with reading(path, _FORGET), path.open("rb") as file:
+        for line in file:
+            try:
+                json.loads(line)
+            except (ValueError, RecursionError):
+                break
+            if not line.endswith(b"\n"):
+                break
+            whole.append(len(line))
+    return whole
 
 
 @contextlib.contextmanager
-def _prepared(path: Path, config: Config) -> Iterator[None]:
-    """The folder, made or recognized, locked and clean."""
+def _prepared(path: Path, config: Config, notes: list[str]) -> Iterator[None]:
+    """The folder, made or recognized, locked and clean; `notes` gets what was mended."""
+    _mend_mark(path, notes)
     _require_run_or_nothing(path)
     make_folder(path)
     with _locked(path):
@@ -201,6 +249,22 @@ def _prepared(path: Path, config: Config) -> Iterator[None]:
         with writing(path):
             (path / "generations.jsonl").touch()
         yield
+
+
+def _mend_mark(path: Path, notes: list[str]) -> None:
+    """Writes format.json again where it is lost or damaged and all else says that this is a run folder."""
+    mark = path / "format.json"
+    try:
+        read_json(mark, "")
+        return
+    except UserError:
+        others = (path / "config.yaml", path / "provenance.json", path / "generations.jsonl")
+        if not all(file.is_file() for file in others) or (mark.exists() and not mark.is_file()):
+            return
+    stored_config(path)
+    if "config_hash" in read_json(path / "provenance.json", _FORGET):
+        replace_json(mark, {"format": FORMAT, "version": VERSION})
+        notes.append(f"{mark} was lost or damaged, and is written again")
 
 
 def _require_run_or_nothing(path: Path) -> None:
@@ -219,12 +283,24 @@ def _claim(path: Path, config: Config) -> None:
         replace_json(path / "format.json", {"format": FORMAT, "version": VERSION})
     require_format(path)
     if not (path / "config.yaml").is_file():
+        _require_hash(path, configuration.config_hash(config))
         replace(path / "config.yaml", configuration.dump(config).encode())
     changed = configuration.differences(stored_config(path), config)
     if changed:
         keys = [f"  {key}: {old!r} in the folder, {new!r} now" for key, (old, new) in changed.items()]
         head = f"{path} holds a run with another configuration; choose another folder, or set back"
         raise UserError("\n".join([head, *keys]))
+
+
+def _require_hash(path: Path, mine: str) -> None:
+    """Refuses another configuration where config.yaml is lost, by the hashes that other files carry."""
+    for file in (path / "provenance.json", path / "initial.json", *sorted((path / "elites").glob("*.json"))):
+        theirs = read_json(file, _FORGET).get("config_hash", mine) if file.is_file() else mine
+        if theirs != mine:
+            raise UserError(
+                f"{path} has lost its config.yaml, and {file.name} is of another configuration ({theirs}, this one is "
+                f"{mine}); restore config.yaml, give the run's own configuration, or choose another folder"
+            )
 
 
 def _add_start(path: Path, config: Config) -> None:
@@ -271,19 +347,17 @@ def _checkpoints(path: Path) -> Iterator[Any]:
             checkpointer.close()
 
 
-def _load(checkpointer: Any, state: State) -> State:
+def _load(checkpointer: Any, checkpoint: Any, state: State) -> State:
     import jax
     import jax.numpy as jnp
 
     shapes = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=x.sharding), state)
-    latest = checkpointer.latest
     try:
-        loaded = checkpointer.load(latest.step, shapes)
+        loaded = checkpointer.load(checkpoint.step, shapes)
     except (KeyError, ValueError, OSError) as error:
-        before = " or remove it, to go on from the state before it;" if len(checkpointer.checkpoints) > 1 else ""
         raise UserError(
-            f"{latest.path} is no state of this search: it is damaged, or another version or precision wrote it; "
-            f"go on with what provenance.json names,{before} or choose another folder"
+            f"{checkpoint.path} is no state of this search: it is damaged, or another version or precision wrote it; "
+            "go on with what provenance.json names, or choose another folder"
         ) from error
     # A loaded array is bound to its devices; a fresh one moves to where the evaluations are.
     return jax.tree.map(lambda x: jnp.asarray(np.asarray(x.addressable_data(0))), loaded)

@@ -1,16 +1,19 @@
 """Evaluation -> the stable result format of `elites/NNN.npz` and `NNN.json`, which others read."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import jax
 import numpy as np
 
 from rtcd_jax.config.load import config_hash
+from rtcd_jax.evaluation import elite_budget
 from rtcd_jax.numerics.proportion import failure_bound
 from rtcd_jax.policy import options
 from rtcd_jax.problem import Problem
+from rtcd_jax.search.archive import OBJECTIVES, volume
 from rtcd_jax.types import Evaluation, Status
-from rtcd_jax.validation import Effort
+from rtcd_jax.validation import PhysicsComparison
 
 
 def arrays_of(problem: Problem, evaluation: Evaluation) -> dict[str, np.ndarray]:
@@ -40,8 +43,17 @@ def arrays_of(problem: Problem, evaluation: Evaluation) -> dict[str, np.ndarray]
     }
 
 
-def record_of(problem: Problem, effort: Effort, evaluation: Evaluation) -> dict[str, Any]:
-    """What a human wants to read of one candidate, and what its numbers mean."""
+def record_of(
+    problem: Problem,
+    evaluation: Evaluation,
+    others: Sequence[Evaluation] = (),
+    physics: PhysicsComparison | None = None,
+) -> dict[str, Any]:
+    """What a human wants to read of one candidate, and what its numbers mean.
+
+    `others` are its evaluations under other keys, `physics` is MJX beside the closed form.
+    """
+    budget = elite_budget(problem)
     host = jax.tree.map(np.asarray, evaluation)
     plant, config = problem.plant, problem.config
     funnel, volumes = host.funnel, host.volumes
@@ -62,14 +74,11 @@ def record_of(problem: Problem, effort: Effort, evaluation: Evaluation) -> dict[
         "state_limits": [limit if np.isfinite(limit) else None for limit in problem.state_limits.tolist()],
         "status": Status(int(host.status)).name,
         "rung": "sampled",
-        "epsilon": epsilon(funnel.trials, config.funnel.confidence),
+        "epsilon": epsilon(funnel.trials, config.funnel.confidence, budget.rounds * (config.elites.count + 1)),
         "confidence": config.funnel.confidence,
         "samples": int(funnel.trials.min()),
         "volumes": {
-            "sum": volumes.total,
-            "integral": volumes.integral,
-            "inlet": volumes.inlet,
-            "geometric_mean": volumes.geometric_mean,
+            **{name: volume(volumes, name) for name in OBJECTIVES},
             "share_of_largest_knot": float(volumes.per_knot.max() / max(volumes.total, np.finfo(float).tiny)),
         },
         "duration": float(funnel.policy.trajectory.dt * problem.intervals),
@@ -78,15 +87,29 @@ def record_of(problem: Problem, effort: Effort, evaluation: Evaluation) -> dict[
             "defect": funnel.policy.trajectory.defect,
             "iterations": funnel.policy.trajectory.iterations,
         },
-        "followed_to_the_goal": effort.follow,
+        "followed_to_the_goal": bool(budget.samples_per_knot),
+        "spread": _spread(others) if len(others) > 1 else None,
+        "mjx": None if physics is None else dict(vars(jax.tree.map(np.asarray, physics))),
         "seed": config.search.seed,
         "config_hash": config_hash(config),
     }
 
 
-def epsilon(trials: np.ndarray, confidence: float) -> float:
+def epsilon(samples: np.ndarray, confidence: float, statements: int) -> float:
     """Largest failure probability of a state uniform in any knot's ellipsoid, at `confidence` jointly for all knots.
 
-    `trials` [K] states of each knot had no failure; Bonferroni's share of the doubt for each knot.
+    `samples` [K] held-out samples of each knot had no failure in a round that had none at all. The doubt is shared by
+    `statements`: the rounds, of which the first clean one counts, times the candidates, of which the best is chosen by
+    these numbers. The knots need no share: one that fails too often keeps the whole round from being clean
+    (docs/theory.md, section 4).
     """
-    return float(np.max(failure_bound(np.asarray(trials, float), (1 - confidence) / len(trials))))
+    return failure_bound(int(np.min(samples)), (1 - confidence) / statements)
+
+
+def _spread(evaluations: Sequence[Evaluation]) -> dict[str, Any]:
+    """Standard deviation over mean of every volume, over evaluations that differ in their random numbers alone."""
+    volumes = {name: [float(volume(e.volumes, name)) for e in evaluations] for name in OBJECTIVES}
+    relative = {
+        name: np.std(found, ddof=1) / np.mean(found) if np.mean(found) else None for name, found in volumes.items()
+    }
+    return {"keys": len(evaluations), "volumes": relative}

@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 
 import jax
@@ -11,14 +10,15 @@ import numpy as np
 
 from rtcd_jax.config.load import Config
 from rtcd_jax.elite.records import elite_names
-from rtcd_jax.evaluation import device_chunk, elite_effort, make_evaluate, resample
+from rtcd_jax.evaluation import device_chunk, make_evaluate
 from rtcd_jax.genome import initial_genome
 from rtcd_jax.problem import Problem, make_problem
 from rtcd_jax.run.folder import RunFolder
 from rtcd_jax.run.format import arrays_of, record_of
+from rtcd_jax.run.reevaluation import Reevaluation, Reported, physics_line, row
 from rtcd_jax.run.sharding import Spread, spread
 from rtcd_jax.search import search
-from rtcd_jax.search.archive import Elites
+from rtcd_jax.search.archive import OBJECTIVES, Elites
 from rtcd_jax.system.cluster import Cluster, Preempted
 from rtcd_jax.system.console import Clock, Console, Progress, times
 from rtcd_jax.system.errors import UserError
@@ -46,6 +46,8 @@ def optimize(config: Config, folder: Path, console: Console, cluster: Cluster) -
     example = jax.eval_shape(make_evaluate(problem), genomes, jax.random.key(0))
     with RunFolder.open(folder, config, cluster) as run:
         begun = run.restore(search.start(plan, example))
+        for note in run.notes:
+            console.message(note)
         done = int(begun.generation)
         whole = bool(cluster.agreed(np.asarray((folder / LAST_FILE).is_file())))
         if done == config.search.generations and whole:
@@ -56,10 +58,10 @@ def optimize(config: Config, folder: Path, console: Console, cluster: Cluster) -
         console.message(
             f"compiling the evaluation of {config.search.population} candidates on {cluster}: a minute or so"
         )
-        again = _Again(problem, cluster, example)
+        again = Reevaluation(problem, cluster, example, console)
         state, pace = begun, _Pace(config)
         try:
-            for state, generation in search.run(plan, evaluate, begun):
+            for state, generation in _first_announced(search.run(plan, evaluate, begun), console):
                 run.append(vars(generation))
                 run.save_if_due(state, int(state.generation))
                 console.progress(pace.progress(generation))
@@ -68,11 +70,27 @@ def optimize(config: Config, folder: Path, console: Console, cluster: Cluster) -
             run.save(state, int(state.generation))
             raise
         run.save(state, int(state.generation))
-        last = config.search.generations
-        found = again([*_filled(state.elites), _initial(problem, evaluate)], search.last_key(plan), last + 1, console)
-        finished = search.finish(plan, state, _stacked(found[:-1], state.elites))
-        cluster.on_first(lambda: _store(problem, finished, found[-1], run, console))
+        *sampled, initial = again.sample([*_filled(state.elites), _initial(problem, evaluate)])
+        best_first = _filled(search.finish(plan, state, _stacked(sampled, state.elites)))
+        if not best_first:
+            raise UserError(
+                "none of the elites kept a funnel under more samples: raise funnel.directions or funnel.trials, "
+                "so that the search is not misled by luck"
+            )
+        reported = again.report(best_first, initial)
+        cluster.on_first(lambda: _store(problem, *reported, run, console))
         return True
+
+
+def _first_announced(
+    steps: Iterator[tuple[search.SearchState, search.Generation]], console: Console
+) -> Iterator[tuple[search.SearchState, search.Generation]]:
+    """The same steps; while the first one compiles, the console says so."""
+    with console.waiting("compiling and evaluating the first generation"):
+        first = next(steps, None)
+    if first is not None:
+        yield first
+        yield from steps
 
 
 class _Pace:
@@ -105,51 +123,9 @@ def _volume(value: float) -> str:
     return "none" if math.isnan(value) else f"{value:.5g}"
 
 
-class _Again:
-    """The elites' second evaluation, more thorough: one candidate on every device at a time.
-
-    Its program compiles from the start on, beside the evaluation's own.
-    """
-
-    def __init__(self, problem: Problem, cluster: Cluster, population: Evaluation):
-        self._cluster = cluster
-        pool = ThreadPoolExecutor(1)
-        self._program: Future[jax.stages.Compiled] = pool.submit(self._compile, problem, population)
-        pool.shutdown(wait=False)
-
-    def _compile(self, problem: Problem, population: Evaluation) -> jax.stages.Compiled:
-        def one(evaluation, key):
-            again = resample(problem, elite_effort(problem), _row(evaluation, 0), jax.random.wrap_key_data(key))
-            return jax.tree.map(lambda leaf: leaf[None], again)
-
-        blank = jax.tree.map(lambda leaf: np.zeros(leaf.shape[1:], leaf.dtype), population)
-        key = jax.random.key_data(jax.random.key(0))
-        evaluations, whole = self._split([blank] * len(self._cluster.devices)), self._cluster.replicated(key)
-        return self._cluster.shared(one).lower(evaluations, whole).compile()
-
-    def _split(self, evaluations: Sequence[Evaluation]) -> Evaluation:
-        return self._cluster.split(jax.tree.map(lambda *leaves: np.stack(leaves), *evaluations))
-
-    def __call__(
-        self, evaluations: Sequence[Evaluation], key: jax.Array, step: int, console: Console
-    ) -> list[Evaluation]:
-        """Each with its funnel sampled again. Raises Preempted between two rounds, the first look being at `step`."""
-        devices, whole = len(self._cluster.devices), self._cluster.replicated(jax.random.key_data(key))
-        found: list[Evaluation] = []
-        for begin in range(0, len(evaluations), devices):
-            self._cluster.look(step + begin)
-            batch = [*evaluations[begin : begin + devices]]
-            batch += batch[-1:] * (devices - len(batch))
-            sampled = self._cluster.gathered(self._program.result()(self._split(batch), whole))
-            found += [_row(sampled, k) for k in range(devices)]
-            done = min(len(found), len(evaluations))
-            console.message(f"funnel sampled again: {done} of {len(evaluations)}")
-        return found[: len(evaluations)]
-
-
 def _filled(elites: Elites) -> list[Evaluation]:
     records = jax.device_get(elites.evaluation)
-    return [_row(records, k) for k in range(int(elites.count))]
+    return [row(records, k) for k in range(int(elites.count))]
 
 
 def _stacked(evaluations: list[Evaluation], elites: Elites) -> Evaluation:
@@ -160,44 +136,42 @@ def _stacked(evaluations: list[Evaluation], elites: Elites) -> Evaluation:
 
 def _initial(problem: Problem, evaluate: Callable[..., Spread]) -> Evaluation:
     genome = np.asarray(initial_genome(problem))
-    return _row(evaluate(genome[None], jax.random.key(0)).take(np.array([0])), 0)
+    return row(evaluate(genome[None], jax.random.key(0)).take(np.array([0])), 0)
 
 
-def _store(problem: Problem, elites: Elites, initial: Evaluation, run: RunFolder, console: Console) -> None:
+def _store(problem: Problem, elites: Sequence[Reported], initial: Reported, run: RunFolder, console: Console) -> None:
     """Elites and initial candidate in the run folder, a summary on the console."""
-    best_first = _filled(elites)
-    if not best_first:
-        raise UserError(
-            "none of the elites kept a funnel under more samples: raise funnel.directions or funnel.trials, "
-            "so that the search is not misled by luck"
-        )
-    effort = elite_effort(problem)
-    run.write_elites((arrays_of(problem, found), record_of(problem, effort, found)) for found in best_first)
+    run.write_elites((arrays_of(problem, elite.evaluation), record_of(problem, *elite)) for elite in elites)
     run.tell_time()
-    run.write_initial(arrays_of(problem, initial), record_of(problem, effort, initial))
-    for line in _summary(problem, initial, best_first[0]):
+    run.write_initial(arrays_of(problem, initial.evaluation), record_of(problem, *initial))
+    for line in _summary(problem, initial, elites[0]):
         console.message(line)
-    console.message(f"{len(best_first)} elites in {run.path}")
+    if compared := [reported.physics for reported in (*elites, initial) if reported.physics is not None]:
+        console.message(physics_line(compared))
+    console.message(f"{len(elites)} elites in {run.path}")
 
 
-def _row(evaluation: Evaluation, index: int) -> Evaluation:
-    return jax.tree.map(lambda leaf: leaf[index], evaluation)
-
-
-def _summary(problem: Problem, initial: Evaluation, best: Evaluation) -> Iterator[str]:
-    """The volumes of the initial and the best candidate with their ratios, and what the best one is."""
-    yield f"{'volume (sampled)':20}{'initial':>12}{'best':>12}{'ratio':>9}"
-    for label, name in (("sum", "total"), *((name,) * 2 for name in ("integral", "inlet", "geometric_mean"))):
-        before, after = float(getattr(initial.volumes, name)), float(getattr(best.volumes, name))
-        ratio = f"{after / before:9.2f}" if before > 0 else f"{'-':>9}"
-        yield f"{label:20}{before:12.5g}{after:12.5g}{ratio}"
-    if int(initial.status) != Status.OK:
-        yield f"the initial candidate has no funnel: {Status(int(initial.status)).message}"
+def _summary(problem: Problem, initial: Reported, best: Reported) -> Iterator[str]:
+    """The volumes of the initial and the best candidate with their spreads and ratios, and what the best one is."""
+    before, after = record_of(problem, *initial), record_of(problem, *best)
+    yield f"{'volume (sampled)':18}{'initial':>12}{'spread':>9}{'best':>12}{'spread':>9}{'ratio':>9}"
+    for name in OBJECTIVES:
+        cells = [f"{name:18}"]
+        for record in (before, after):
+            spread = record["spread"]["volumes"][name] if record["spread"] else None
+            cells.append(f"{record['volumes'][name]:12.5g}{'-' if spread is None else f'{spread:.1%}':>9}")
+        first, last = before["volumes"][name], after["volumes"][name]
+        cells.append(f"{last / first:9.2f}" if first > 0 else f"{'-':>9}")
+        yield "".join(cells)
+    if before["status"] != Status.OK.name:
+        yield f"the initial candidate has no funnel: {Status[before['status']].message}"
+    promise = f"probability <= {after['epsilon']:.2g} (confidence {after['confidence']:g})"
+    yield f"best: a state uniform in any of its ellipsoids fails to arrive with {promise}"
     design = ", ".join(
-        f"{name} {float(getattr(best.candidate.design, name)):.4g} {unit}"
-        for name, unit in problem.plant.design_units.items()
+        f"{name} {after['design'][name]:.4g} {unit}" for name, unit in problem.plant.design_units.items()
     )
-    weights = ", ".join(f"{value:.4g}" for value in (*best.candidate.q.tolist(), *best.candidate.r.tolist()))
-    options = {"authority": best.candidate.authority, "discount": best.candidate.discount}
+    weights = ", ".join(f"{value:.4g}" for value in (*after["weights"]["q"], *after["weights"]["r"]))
+    chosen = best.evaluation.candidate
+    options = {"authority": chosen.authority, "discount": chosen.discount}
     searched = "".join(f"; {name} {float(value):.4g}" for name, value in options.items() if value is not None)
     yield f"best: {design}; diagonals of Q and R: {weights}{searched}"

@@ -126,9 +126,17 @@ def _name(number: int, values: Mapping[str, Any]) -> str:
     return "_".join([f"{number:03d}", *(re.sub(r"[^\w.=+-]+", "-", part).strip("-") for part in parts)])
 
 
-def show(cases: Sequence[Case], folder: Path) -> str:
+def show(cases: Sequence[Case]) -> str:
     """A table of the cases: their values, how far they are, and the sampled volume that they maximize, of their
-    initial and of their best candidate. All four volumes of each are stored as `table.csv` in the folder."""
+    initial and of their best candidate."""
+    rows = [_row(case) for case in cases]
+    headings = ("case", *cases[0].values, "generations", "initial", "best", "ratio")
+    cells = [_cells(case, row) for case, row in zip(cases, rows, strict=True)]
+    return table(headings, cells, "volumes are of the sampled rung")
+
+
+def store(cases: Sequence[Case], folder: Path) -> Path:
+    """All four volumes of each case as `table.csv` in the folder; the file."""
     rows = [_row(case) for case in cases]
     text = io.StringIO()
     writer = csv.DictWriter(text, list(rows[0]), lineterminator="\n")
@@ -136,9 +144,7 @@ def show(cases: Sequence[Case], folder: Path) -> str:
     writer.writerows(rows)
     make_folder(folder)
     replace(folder / TABLE, text.getvalue().encode())
-    headings = ("case", *cases[0].values, "generations", "initial", "best", "ratio")
-    cells = [_cells(case, row) for case, row in zip(cases, rows, strict=True)]
-    return f"{table(headings, cells, 'volumes are of the sampled rung')}\n{folder / TABLE}"
+    return folder / TABLE
 
 
 def _cells(case: Case, row: Mapping[str, Any]) -> list[str]:

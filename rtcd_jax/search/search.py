@@ -160,11 +160,6 @@ def run(plan: Plan, evaluate: Evaluate, state: SearchState) -> Iterator[tuple[Se
         yield state, generation
 
 
-def last_key(plan: Plan) -> Key[Array, ""]:
-    """The random numbers of the elites' second evaluation."""
-    return _key(plan, plan.settings.generations)
-
-
 def finish(plan: Plan, state: SearchState, evaluation: Evaluation) -> Elites:
     """The elites by their second `evaluation` [E], slot by slot, sorted anew; those that failed it are dropped.
 

@@ -17,7 +17,7 @@ import numpy as np
 from jax.experimental import multihost_utils
 from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec
 
-from rtcd_jax.system.devices import memory_of
+from rtcd_jax.system.devices import memory_of, require_devices
 from rtcd_jax.system.errors import UserError
 
 HEARTBEAT = 30
@@ -71,8 +71,9 @@ class Cluster:
         """The first `limit` devices of each process, or all.
 
         Raises:
-            UserError: there are fewer.
+            UserError: there are fewer, or none of the kind that JAX_PLATFORMS or Slurm says.
         """
+        require_devices()
         if limit is not None and limit > jax.local_device_count():
             have = f"{jax.local_device_count()} {jax.devices()[0].device_kind}"
             raise UserError(f"--devices = {limit}: this process sees {have} devices")

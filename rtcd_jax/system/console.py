@@ -1,11 +1,13 @@
 """What a verb says: messages that stay, the progress of long work as a live line on a terminal, and tables."""
 
+import contextlib
 import io
 import math
 import sys
 import time
-from collections.abc import Container, Iterable, Sequence
+from collections.abc import Container, Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from threading import Event, Thread
 from typing import Self, TextIO, final
 
 from rich.box import SIMPLE
@@ -16,6 +18,9 @@ from rich.table import Table
 
 WIDTH = 150
 """Characters of a table's row at most; longer cells are wrapped."""
+
+WAITING = 10.0
+"""Seconds between two lines about work that cannot say how far it is."""
 
 
 @final
@@ -93,6 +98,24 @@ class Console:
             self._bar.start()
         task = self._bar.task_ids[0]
         self._bar.update(task, completed=now.done, total=now.total, description=now.text, refresh=True)
+
+    @contextlib.contextmanager
+    def waiting(self, text: str, every: float = WAITING) -> Iterator[None]:
+        """Around what takes long and cannot say how far it is, compilation: `text` with the elapsed time, again and
+        again until it is over."""
+        over, clock = Event(), Clock()
+
+        def tell() -> None:
+            while not over.wait(every):
+                self.message(f"{text}  elapsed {duration(clock.elapsed)}")
+
+        teller = Thread(target=tell, daemon=True)
+        teller.start()
+        try:
+            yield
+        finally:
+            over.set()
+            teller.join()
 
 
 def silent() -> Console:

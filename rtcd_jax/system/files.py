@@ -48,11 +48,15 @@ def replace(path: Path, content: bytes) -> None:
     """The old file or the new one, never a part, whenever the process or the machine stops."""
     temporary = path.with_name(f".{path.name}.tmp")
     with writing(path):
-        with temporary.open("wb") as file:
-            file.write(content)
-            file.flush()
-            os.fsync(file.fileno())
-        temporary.replace(path)
+        try:
+            with temporary.open("wb") as file:
+                file.write(content)
+                file.flush()
+                os.fsync(file.fileno())
+            temporary.replace(path)
+        except BaseException:  # a disk that is full, or Ctrl-C: no half file stays
+            temporary.unlink(missing_ok=True)
+            raise
     sync(path.parent)
 
 
@@ -69,6 +73,8 @@ def sync(path: Path) -> None:
 def read_json(path: Path, advice: str) -> dict[str, Any]:
     """The object in a JSON file. Raises `UserError` as `reading` does."""
     with reading(path, advice):
+        if path.exists() and not path.is_file():  # a pipe would be waited for
+            raise TypeError("it is no file")
         found = json.loads(path.read_text(encoding="utf-8"))
         if not isinstance(found, dict):
             raise TypeError(f"must be a JSON object, is {found!r:.40}")

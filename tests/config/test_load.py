@@ -135,7 +135,7 @@ REFUSED = {
     ),
     "zero weight": ({"weights.q.0.min": 0}, "weights.q.0.min = 0.0: must be >= 1e-09: weights have a log scale"),
     "mixed without a share": (
-        {"funnel.mjx_share": 0},
+        {"funnel.rollouts": "mixed", "funnel.mjx_share": 0},
         "funnel.mjx_share = 0.0: must be > 0 when rollouts = 'mixed', or choose 'closed_form'",
     ),
     "goal's step": ({"funnel.goal.step": 8}, "funnel.goal.step = 8.0: must be < horizon = 2"),
@@ -233,6 +233,10 @@ ENDS = [
     ("elites.distance", 0.999, 1),
     ("elites.trials", 1, 0),
     ("elites.trials", 10**8, 10**19),
+    ("elites.mjx_states", 0, -1),
+    ("elites.mjx_states", 10**8, 10**19),
+    ("elites.keys", 0, -1),
+    ("elites.keys", 1000, 1001),
     ("elites.directions", 1, 0),
     ("elites.directions", 1_000_000, 1_000_001),
     ("checkpoint.seconds", 0, -1e-9),
@@ -268,7 +272,8 @@ def test_every_number_has_both_ends(model):
 
 @pytest.mark.parametrize(("key", "inside", "outside"), ENDS)
 def test_both_sides_of_every_range(key, inside, outside):
-    changes = {"task.start": [0.5, 0]} if key == "task.state_limits.1" else {}
+    needs = {"task.state_limits.1": {"task.start": [0.5, 0]}, "funnel.mjx_share": {"funnel.rollouts": "mixed"}}
+    changes = needs.get(key, {})
     assert errors(changes | {key: inside}) == []
     (line,) = errors(changes | {key: outside})
     assert "must" in line

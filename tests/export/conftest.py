@@ -6,7 +6,8 @@ from typing import Any, NamedTuple
 
 import pytest
 
-from rtcd_jax.export import export_run
+from rtcd_jax.certificate.prove.certify import certify_elite
+from rtcd_jax.export import export_run, rate
 from rtcd_jax.export.bundle import Bundle, read_bundle
 from tests.export.folders import ELITES, run_folder
 
@@ -20,6 +21,9 @@ class Silent:
     def message(self, text):
         self.lines.append(text)
 
+    def progress(self, now):
+        assert 0 <= now.done <= now.total
+
 
 class Export(NamedTuple):
     """A folder that was exported, what it was exported from, and its own controller module."""
@@ -30,11 +34,32 @@ class Export(NamedTuple):
     module: Any
 
 
+@pytest.fixture(scope="session", autouse=True)
+def _few_states():
+    """Control rates are found by a tenth of the states: what tests hold them to does not depend on their number."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(rate, "STATES", 400)
+        yield
+
+
 @pytest.fixture(scope="session", params=list(ELITES))
 def export(request, tmp_path_factory):
-    """The export of one robot's elite 000."""
+    """The export of one robot's elite 000, sampled."""
     path = tmp_path_factory.mktemp(request.param)
-    run, folder = run_folder(path / "run", request.param), path / "lab"
+    return _exported(run_folder(path / "run", request.param), path / "lab")
+
+
+@pytest.fixture(scope="session")
+def proved(tmp_path_factory):
+    """The export of a pendulum's elite 000 with its certificate."""
+    path = tmp_path_factory.mktemp("proved")
+    run = run_folder(path / "run", "pendulum")
+    (run / "certificates").mkdir()
+    certify_elite(run, "000", "proved", lambda step: None)
+    return _exported(run, path / "lab")
+
+
+def _exported(run, folder):
     export_run(run, 0, folder, Silent())
     bundle = read_bundle(run, "000")
     return Export(run, folder, bundle, module(folder / f"{bundle.label}_controller.py"))

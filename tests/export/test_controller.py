@@ -37,12 +37,14 @@ def library(export, tmp_path_factory):
         source = export.folder / f"{export.bundle.label}_controller.c"
         flags = [*STRICT, *options.split(), "-shared", "-fPIC"]
         subprocess.run([COMPILER, *flags, source, "-o", path, "-lm"], check=True)
-        return _bind(ctypes.CDLL(str(path)), export.bundle)
+        return bind(path, export.bundle)
 
     return functools.cache(compiled)
 
 
-def _bind(compiled, bundle):
+def bind(path, bundle):
+    """The (control, monitor) of a compiled export."""
+    compiled = ctypes.CDLL(str(path))
     n, m = bundle.elite.x_goal.size, bundle.elite.u_max.size
     vector = ctypes.c_double * n
 

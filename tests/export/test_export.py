@@ -3,17 +3,18 @@
 import csv
 import hashlib
 import json
+import shutil
 
 import numpy as np
 import pytest
 import yaml
 
+from rtcd_jax.certificate import check
 from rtcd_jax.elite.records import read_elite
 from rtcd_jax.export import export_run
-from rtcd_jax.export.bundle import read_bundle
 from rtcd_jax.system.errors import UserError
-from tests.certificate import swing
-from tests.export.conftest import Silent
+from tests.certificate.test_check import resealed
+from tests.export.conftest import Silent, module
 from tests.export.folders import run_folder
 
 
@@ -75,24 +76,6 @@ def test_the_bundle_says_what_its_numbers_mean(export):
     parameters = yaml.safe_load((export.folder / "parameters.yaml").read_text())["parameters"]
     assert {name: entry["value"] for name, entry in parameters.items()} == dict(elite.parameters)
     assert all(entry["unit"] for entry in parameters.values())
-
-
-def test_the_least_rate_holds_the_input_for_a_tenth_of_the_fastest_time_constant(run):
-    """The eigenvalues of A - B K at knots and goal, by the equations that the elite was made with."""
-    bundle = read_bundle(run, "000")
-    elite = bundle.elite
-    fastest = max(
-        np.abs(np.linalg.eigvals(np.subtract(*_linear(x, gain)))).max()
-        for x, gain in zip(elite.x, elite.K, strict=True)
-    )
-    rate = bundle.describe()["control_rate"]["least"]
-    assert rate % 50 == 0
-    assert rate - 50 < 10 * fastest <= rate
-
-
-def _linear(x, gain):
-    a, b = swing.linear(x)
-    return a, b @ gain
 
 
 def test_the_mark_has_the_digest_of_every_file(export):
@@ -242,34 +225,49 @@ def test_a_candidate_without_a_funnel_is_not_exported(tmp_path):
         export_run(run, "initial", tmp_path / "lab", Silent())
 
 
-def hexadecimal(array):
-    return [value.hex() for value in np.ravel(array).tolist()]
+def test_a_proved_elites_claim_stands_wherever_its_controller_does(proved):
+    content = json.loads((proved.folder / "certificate.json").read_text())
+    claim = check.seal(content["claim"])
+    assert (proved.folder / "certificate.json").read_bytes() == (proved.run / "certificates" / "000.json").read_bytes()
+    told = json.loads((proved.folder / "pendulum_000_controller.json").read_text())
+    assert (told["certificate"]["rung"], told["certificate"]["claim"]) == ("proved", claim)
+    assert told["certificate"]["volumes"] == check.check(content).volumes
+    assert told["monitor"]["guarantee"] == "proved"
+    assert told["funnel"]["rung"] == "sampled"
+    assert json.loads((proved.folder / "export.json").read_text())["claim"] == claim
+    assert claim == proved.module.CLAIM
+    assert f'pendulum_000_claim[] = "{claim}"' in (proved.folder / "pendulum_000_controller.c").read_text()
+    assert f"`{claim}`" in (proved.folder / "README.md").read_text()
 
 
-@pytest.mark.parametrize("same", [True, False])
-def test_a_certificate_goes_along_if_it_is_of_this_controller(run, tmp_path, same):
-    arrays, _ = read_elite(run / "elites", "000")
-    claim = {key: hexadecimal(arrays[key]) for key in ("x", "u", "K", "K_goal")}
-    if not same:
-        claim["K"] = hexadecimal(1.5 * arrays["K"])
-    (run / "certificates").mkdir()
-    (run / "certificates" / "000.json").write_text(json.dumps({"claim": claim}))
-    (run / "certificates" / "summary.json").write_text('{"000": {"rung": "proved", "start": 0.0}}')
-    console = Silent()
-    export_run(run, 0, tmp_path / "lab", console)
-    told = json.loads((tmp_path / "lab" / "pendulum_000_controller.json").read_text())["certificate"]
-    assert (tmp_path / "lab" / "certificate.json").is_file() == same
-    assert (told is not None) == same
-    if same:
-        assert (told["rung"], told["from"]) == ("proved", 0.0)
-        assert "rung proved" in console.lines[1]
-        assert "rung proved" in (tmp_path / "lab" / "README.md").read_text()
-    else:
-        assert "certificate: none" in console.lines[1]
+def cheat(content):
+    """A matrix of the proof is another: the checker refuses it."""
+    piece = content["funnel"][0]
+    witness = next(iter(piece["cases"].values()))
+    witness["gram"][0][0] = "-0x1.0p+3"
+    return resealed(content)
 
 
-def test_a_damaged_certificate_is_named(run, tmp_path):
-    (run / "certificates").mkdir()
-    (run / "certificates" / "000.json").write_text("{")
-    with pytest.raises(UserError, match=r"cannot read .*000.json.*prove it again by `rtcd certify"):
-        export_run(run, 0, tmp_path / "lab", Silent())
+def heavier(content):
+    content["claim"]["parameters"]["m"] = (6.0).hex()
+    return resealed(content)
+
+
+WORTHLESS = {"refused": cheat, "of another elite": heavier, "damaged": lambda content: "{"}
+
+
+@pytest.mark.parametrize("verdict", WORTHLESS)
+def test_a_certificate_that_does_not_prove_this_elite_does_not_go_along(proved, tmp_path, verdict):
+    run = shutil.copytree(proved.run, tmp_path / "run")
+    certificate = run / "certificates" / "000.json"
+    changed = WORTHLESS[verdict](json.loads(certificate.read_text()))
+    certificate.write_text(changed if isinstance(changed, str) else json.dumps(changed))
+    console, target = Silent(), tmp_path / "lab"
+    export_run(run, 0, target, console)
+    assert not (target / "certificate.json").exists()
+    told = json.loads((target / "pendulum_000_controller.json").read_text())
+    assert (told["certificate"], told["monitor"]["guarantee"]) == (None, "sampled")
+    assert json.loads((target / "export.json").read_text())["claim"] is None
+    assert f"certificate: {verdict}, so it does not go along: " in console.lines[1]
+    assert f"Nothing is proved: the certificate is {verdict}." in (target / "README.md").read_text()
+    assert module(target / "pendulum_000_controller.py").CLAIM == ""

@@ -368,6 +368,105 @@ def test_a_full_disk_is_named_for_every_file(tmp_path, monkeypatch):
                 write()
 
 
+def at_generations(path, *saved):
+    """A run of `experiment`, with states saved after these generations."""
+    config = experiment(generations=9)
+    plan = plan_of(config)
+    with RunFolder.open(path, config) as folder:
+        for state, record in search.run(plan, bowl, folder.restore(begin(plan))):
+            folder.append(vars(record))
+            if record.index + 1 in saved:
+                folder.save(state, record.index + 1)
+    return config, plan
+
+
+def damaged(state):
+    for file in [file for file in state.rglob("*") if file.is_file()]:
+        file.write_bytes(file.read_bytes()[:10])
+
+
+def test_a_damaged_newest_state_is_set_aside_and_the_one_before_goes_on(tmp_path):
+    config, plan = at_generations(tmp_path / "run", 3, 6)
+    damaged(tmp_path / "run" / "state" / "6")
+    with RunFolder.open(tmp_path / "run", config) as folder:
+        assert int(folder.restore(begin(plan)).generation) == 3
+        (note,) = folder.notes
+    assert "state/6 is no state of this search" in note
+    assert note.endswith("going on with the state of generation 3")
+    assert [path.name for path in (tmp_path / "run" / "state.damaged").iterdir()] == ["6"]
+    assert len((tmp_path / "run" / "generations.jsonl").read_bytes().splitlines()) == 3
+    drive(tmp_path / "run", config)
+    drive(tmp_path / "whole", config)
+    assert results(tmp_path / "run") == results(tmp_path / "whole")
+
+
+def test_where_every_state_is_damaged_nothing_is_moved(tmp_path):
+    config, plan = at_generations(tmp_path / "run", 3, 6)
+    for state in (3, 6):
+        damaged(tmp_path / "run" / "state" / f"{state}")
+    with (
+        RunFolder.open(tmp_path / "run", config) as folder,
+        pytest.raises(UserError, match=r"state/6 is no state of this search"),
+    ):
+        folder.restore(begin(plan))
+    assert sorted(path.name for path in (tmp_path / "run" / "state").glob("[0-9]*")) == ["3", "6"]
+    assert not (tmp_path / "run" / "state.damaged").exists()
+
+
+@pytest.mark.parametrize("cut", [4, 5])
+def test_lines_that_are_lost_take_the_state_before_them(tmp_path, cut):
+    config, plan = at_generations(tmp_path / "run", 3, 6)
+    lines = (tmp_path / "run" / "generations.jsonl").read_bytes().splitlines(keepends=True)
+    (tmp_path / "run" / "generations.jsonl").write_bytes(b"".join([*lines[:cut], b"{torn\n", *lines[cut:]]))
+    with RunFolder.open(tmp_path / "run", config) as folder:
+        assert int(folder.restore(begin(plan)).generation) == 3
+        assert f"has {cut} complete lines" in folder.notes[0]
+
+
+@pytest.mark.parametrize("content", [None, b"", b"[" * 100_000, b'{"format": '])
+def test_a_mark_that_is_lost_or_damaged_is_written_again(tmp_path, content):
+    config, plan = at_generations(tmp_path / "run", 3)
+    mark = tmp_path / "run" / "format.json"
+    whole = mark.read_bytes()
+    mark.unlink() if content is None else mark.write_bytes(content)
+    with RunFolder.open(tmp_path / "run", config) as folder:
+        assert folder.notes == [f"{mark} was lost or damaged, and is written again"]
+        assert int(folder.restore(begin(plan)).generation) == 3
+    assert mark.read_bytes() == whole
+
+
+def test_another_configuration_is_refused_even_without_the_stored_one(tmp_path):
+    config, _ = at_generations(tmp_path / "run", 3)
+    (tmp_path / "run" / "config.yaml").unlink()
+    other = experiment(generations=8)
+    with pytest.raises(UserError, match=r"has lost its config.yaml, and provenance.json is of another configuration"):
+        RunFolder.open(tmp_path / "run", other)
+    assert not (tmp_path / "run" / "config.yaml").exists()
+    with RunFolder.open(tmp_path / "run", config):
+        assert (tmp_path / "run" / "config.yaml").is_file()
+
+
+@pytest.mark.parametrize("name", ["provenance.json", "format.json", "config.yaml", "generations.jsonl"])
+@pytest.mark.parametrize("content", [b"[" * 100_000, b'{"a": ' * 100_000])
+def test_deep_nesting_is_one_error_that_names_the_file(tmp_path, name, content):
+    config, plan = at_generations(tmp_path / "run", 3)
+    for lost in ("config.yaml", "format.json") if name == "format.json" else ():
+        (tmp_path / "run" / lost).unlink()
+    (tmp_path / "run" / name).write_bytes(content + b"\n")
+    with pytest.raises(UserError, match=name), RunFolder.open(tmp_path / "run", config) as folder:
+        folder.restore(begin(plan))
+
+
+def test_a_write_that_fails_leaves_no_temporary(tmp_path, monkeypatch):
+    def full(_):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(files.os, "fsync", full)
+    with pytest.raises(UserError, match="No space left on device"):
+        files.replace(tmp_path / "a.json", b"long")
+    assert list(tmp_path.iterdir()) == []
+
+
 FULL = """
 import resource, signal, sys
 from pathlib import Path

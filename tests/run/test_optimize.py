@@ -19,6 +19,7 @@ import yaml
 from rtcd_jax.config import load as configuration
 from rtcd_jax.elite.records import elite_names, read_elite, read_generations
 from rtcd_jax.run import optimize as run
+from rtcd_jax.run import reevaluation
 from rtcd_jax.run.optimize import LAST_FILE
 from rtcd_jax.system.cluster import Cluster
 from rtcd_jax.system.errors import UserError
@@ -38,7 +39,7 @@ SMALL = yaml.safe_load(configuration.EXAMPLE) | {
         "goal": {"directions": 16, "radii": 6, "horizon": 1.0, "step": 0.02},
     },
     "search": {"population": 6, "generations": GENERATIONS},
-    "elites": {"count": 2, "trials": 200, "directions": 32},
+    "elites": {"count": 2, "trials": 200, "directions": 32, "mjx_states": 0, "keys": 2},
     "checkpoint": {"seconds": 0.0},
 }
 
@@ -264,7 +265,7 @@ def _failing(genomes, key):
 
 def _run_with(monkeypatch, evaluate, folder):
     monkeypatch.setattr(run, "make_evaluate", lambda problem: evaluate)
-    monkeypatch.setattr(run, "resample", lambda problem, effort, row, key: eqx.tree_at(
+    monkeypatch.setattr(reevaluation, "resample", lambda problem, budget, row, key, samples: eqx.tree_at(
         lambda e: e.status, row, jnp.int32(Status.FUNNEL_EMPTY)))  # fmt: skip
     screen = Screen()
     try:

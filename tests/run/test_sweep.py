@@ -8,7 +8,7 @@ import yaml
 
 from rtcd_jax.cli import main as cli
 from rtcd_jax.config.load import EXAMPLE, load, parse_yaml
-from rtcd_jax.run.sweep import read_cases, show
+from rtcd_jax.run.sweep import read_cases, show, store
 from rtcd_jax.system.errors import ConfigError, UserError
 from tests.paths import ROOT
 
@@ -89,7 +89,7 @@ def test_the_table_has_what_is_known(tmp_path):
     (folder / "initial.json").write_text(json.dumps({"volumes": volumes}))
     (folder / "elites" / "000.json").write_text(json.dumps({"volumes": volumes | {"sum": 7.0}}))
     (folder / "generations.jsonl").write_text("{}\n{}\n{}\n")
-    lines = show(cases, tmp_path / "runs").splitlines()
+    lines = [*show(cases).splitlines(), str(store(cases, tmp_path / "runs"))]
     assert [line.split() for line in lines[-4:-1]][1:] == [["0", "0", "0/60"], ["1", "1", "3/60", "2", "7", "3.5"]]
     with (tmp_path / "runs" / "table.csv").open() as file:
         nothing, something = csv.DictReader(file)

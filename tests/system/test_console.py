@@ -2,6 +2,7 @@
 
 import io
 import math
+from threading import Event
 
 import pytest
 
@@ -67,3 +68,23 @@ def test_a_table_is_text_whatever_the_terminal_is(monkeypatch):
     lines = [line.rstrip() for line in shown.splitlines() if line.strip()]
     assert lines[0].strip() == "title"
     assert lines[-3:] == ["  a             1.5", "  long name   2 [m]", "  short row"]
+
+
+def test_what_takes_long_says_so_again_and_again_until_it_is_over():
+
+    seen = Event()
+
+    class Heard(Screen):
+        def write(self, text):
+            written = super().write(text)
+            if self.text.count("compiling  elapsed 0:0") >= 2:
+                seen.set()
+            return written
+
+    stream = Heard()
+    with stream.console.waiting("compiling", every=0.01):
+        assert seen.wait(20)
+    lines = stream.text.count("\n")
+    seen.clear()
+    assert not seen.wait(0.1)
+    assert stream.text.count("\n") == lines

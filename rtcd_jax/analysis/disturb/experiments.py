@@ -19,9 +19,9 @@ import numpy as np
 
 from rtcd_jax.analysis.disturb.comparison import Contest, by_loop
 from rtcd_jax.analysis.disturb.scenarios import LONGEST_DELAY, PULSES, STEP, Lanes, Outcome, undisturbed
-from rtcd_jax.analysis.verify.verification import clopper_pearson
 from rtcd_jax.elite.closed_loop import ARRIVED
 from rtcd_jax.elite.elite import Elite
+from rtcd_jax.numerics.proportion import clopper_pearson
 
 CONFIDENCE = 0.95
 """Of the two-sided intervals of the shares."""

@@ -8,9 +8,9 @@ import numpy as np
 from jaxtyping import Float
 
 from rtcd_jax.analysis.report.canvas import BLACK, GRAY, LIGHT, SMALL, WIDTH, blank, written
-from rtcd_jax.analysis.report.reading import FunnelView, Run, shown
+from rtcd_jax.analysis.report.reading import FunnelView, Run, funnel_views
 from rtcd_jax.analysis.report.shapes import outlines, planes, projections
-from rtcd_jax.analysis.report.words import VOLUMES, listed, quantity, rung, volume_unit, words
+from rtcd_jax.analysis.report.words import VOLUMES, guarantee, listed, quantity, volume_unit, words
 from rtcd_jax.config.load import Config
 
 if TYPE_CHECKING:
@@ -48,7 +48,7 @@ def draw_levels(run: Run) -> list[Path]:
         volumes.set(xlabel="time [s]", ylabel=f"volume [{volume_unit(run.config)}]")
         for axes in (levels, volumes):
             axes.grid(axis="y", lw=0.4, color=LIGHT)
-        figure.legend(handles=levels.lines, title=rung(run.best.record), ncols=2, loc="outside upper center")
+        figure.legend(handles=levels.lines, title=guarantee(run.best.record), ncols=2, loc="outside upper center")
         return written(figure, run.figures, "levels")
 
 
@@ -57,7 +57,7 @@ def draw_over(runs: Sequence[Run], folder: Path, name: str) -> list[Path]:
 
     The largest lies lowest. Raises UserError if the folder cannot be written.
     """
-    config, funnels, pairs = runs[0].config, shown(runs), planes(runs[0].best.x.shape[1])
+    config, funnels, pairs = runs[0].config, funnel_views(runs), planes(runs[0].best.x.shape[1])
     with blank((WIDTH, 3.4 * len(pairs) + 2.6)) as figure:
         *panels, volumes = figure.subplots(len(pairs) + 1, 1, height_ratios=[3.4] * len(pairs) + [2.0])
         for axes, plane in zip(panels, pairs, strict=True):
@@ -66,7 +66,7 @@ def draw_over(runs: Sequence[Run], folder: Path, name: str) -> list[Path]:
         figure.legend(**told_once(panels), loc="outside upper center")
         for funnel in funnels:
             time, values = funnel.elite.time, funnel.elite.volumes_per_knot
-            volumes.semilogy(time, values, color=funnel.color, label=_told_briefly(funnel))
+            volumes.semilogy(time, values, color=funnel.color, label=_short_label(funnel))
         volumes.set(xlabel="time [s]", ylabel=f"volume of a knot's\nellipsoid [{volume_unit(config)}]")
         volumes.grid(axis="y", lw=0.4, color=LIGHT)
         units = f"volumes in {volume_unit(config)}, integrals in {volume_unit(config, 'integral')}"
@@ -147,8 +147,8 @@ def _beside(figure: "Figure", run: Run) -> None:
 
 def told_once(panels: Sequence["Axes"]) -> dict[str, Any]:
     """The entries of a legend for all that the panels have in common, in one row where they fit."""
-    found = [zip(*axes.get_legend_handles_labels(), strict=True) for axes in panels]
-    handles = {label: handle for pairs in found for handle, label in pairs}
+    entries = (zip(*axes.get_legend_handles_labels(), strict=True) for axes in panels)
+    handles = {label: handle for pairs in entries for handle, label in pairs}
     columns = len(handles) if len(handles) <= 6 else 4
     return {"handles": list(handles.values()), "labels": list(handles), "ncols": columns}
 
@@ -183,7 +183,7 @@ def _draw_limits(axes: "Axes", limits: Sequence[float], view: np.ndarray) -> Non
 def _draw_volumes(axes: "Axes", config: Config, funnels: Sequence[FunnelView]) -> None:
     for funnel in funnels:
         time, values = funnel.elite.time, funnel.elite.volumes_per_knot
-        axes.semilogy(time, values, ".-", ms=4, color=funnel.color, label=_told(config, funnel))
+        axes.semilogy(time, values, ".-", ms=4, color=funnel.color, label=_volumes_label(config, funnel))
     axes.set(xlabel="time [s]", ylabel=f"volume of a knot's\nellipsoid [{volume_unit(config)}]")
     axes.grid(axis="y", lw=0.4, color=LIGHT)
     if len(funnels) == 2:
@@ -192,16 +192,16 @@ def _draw_volumes(axes: "Axes", config: Config, funnels: Sequence[FunnelView]) -
         axes.set_title(f"{second.label} over {first.label}: {', '.join(ratios)}")
 
 
-def _told(config: Config, funnel: FunnelView) -> str:
-    """The four volumes with their rung, which no volume is told without."""
-    told = [f"{words(name)} {funnel.elite.volumes[name]:.4g} {volume_unit(config, name)}" for name in VOLUMES]
-    return f"{funnel.label}: {', '.join(told)}\n{rung(funnel.elite.record)}"
+def _volumes_label(config: Config, funnel: FunnelView) -> str:
+    """The four volumes with their guarantee."""
+    volumes = [f"{words(name)} {funnel.elite.volumes[name]:.4g} {volume_unit(config, name)}" for name in VOLUMES]
+    return f"{funnel.label}: {', '.join(volumes)}\n{guarantee(funnel.elite.record)}"
 
 
-def _told_briefly(funnel: FunnelView) -> str:
-    told = [f"{words(name)} {funnel.elite.volumes[name]:.3g}" for name in VOLUMES]
+def _short_label(funnel: FunnelView) -> str:
+    volumes = [f"{words(name)} {funnel.elite.volumes[name]:.3g}" for name in VOLUMES]
     promise = f", ε = {funnel.elite.epsilon:.2g}" if funnel.elite.guarantee == "sampled" else ""
-    return f"{funnel.label}: {', '.join(told)} ({funnel.elite.guarantee}{promise})"
+    return f"{funnel.label}: {', '.join(volumes)} ({funnel.elite.guarantee}{promise})"
 
 
 def _title(config: Config, funnel: FunnelView) -> str:

@@ -28,8 +28,8 @@ def spread(generations: Generations) -> Float[np.ndarray, "2 generations"]:
     """`QUANTILES` of the searched volume over the feasible candidates of a generation, NaN where there are none."""
     rows = []
     for record in generations:
-        told = record["volumes"][record["objective"]]
-        volumes = np.array([value for value in told if value is not None], float)
+        values = record["volumes"][record["objective"]]
+        volumes = np.array([value for value in values if value is not None], float)
         rows.append(np.percentile(volumes, QUANTILES) if volumes.size else np.full(2, np.nan))
     return np.array(rows).T
 

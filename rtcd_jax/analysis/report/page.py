@@ -19,7 +19,7 @@ from rtcd_jax.analysis.report.plots import plots
 from rtcd_jax.analysis.report.progress import draw_convergence, draw_courses
 from rtcd_jax.analysis.report.reading import Experiment, Run, compared, read_run
 from rtcd_jax.analysis.report.tables import Cell, Table
-from rtcd_jax.analysis.report.words import NONE, duration, listed, ratio, rung, words
+from rtcd_jax.analysis.report.words import NONE, duration, guarantee, listed, ratio, words
 from rtcd_jax.system.console import Console
 from rtcd_jax.system.errors import UserError
 from rtcd_jax.system.files import replace
@@ -35,7 +35,7 @@ _NUMBER, _LONG = ' class="number"', ' class="long"'
 def report(folders: Sequence[Path], to: Path | None = None, console: Console | None = None) -> list[Path]:
     """Writes the page of a finished run, or one that compares several, and its figures; the page's path first.
 
-    Certificates that were not checked yet are checked first, and `console` told how far that is.
+    Certificates that were not checked yet are checked first, and `console` shows how far that is.
 
     One run: `report.html` and `figures/` in its folder. Several: `comparison.html` beside the first folder, with
     `comparison.png` and `.pdf`. `to`, say NAME.html, is another path for the page; then one run's figures are in
@@ -104,16 +104,16 @@ def _header(runs: Sequence[Run]) -> str:
         else:
             about += "; an external funnel, audited"
         cards = "".join(_card(*card) for card in _headlines(runs[0]))
-        told = f'<p class="candidate">{_candidate(runs[0])}</p>'
+        candidate = f'<p class="candidate">{_candidate(runs[0])}</p>'
     else:
         cards = "".join(
-            _card(run.name, f"× {_told(_gain(run, 'sum'))}", f"sum over its initial one, {run.best.guarantee}")
+            _card(run.name, f"× {_four_digits(_gain(run, 'sum'))}", f"sum over its initial one, {run.best.guarantee}")
             for run in runs
         )
-        told = ""
+        candidate = ""
     names = " · ".join(html.escape(run.name) for run in runs)
     head = f'<h1>{names}</h1><p class="about">{html.escape(about)}</p>'
-    return f'<header>{head}{told}<div class="cards">{cards}</div></header>'
+    return f'<header>{head}{candidate}<div class="cards">{cards}</div></header>'
 
 
 def _candidate(run: Run) -> str:
@@ -129,17 +129,17 @@ def _headlines(run: Run) -> Iterator[tuple[str, str, str]]:
     objective = run.config.search.objective
     for name in dict.fromkeys((objective, "sum", "inlet")):
         searched = ", searched" if name == objective else ""
-        yield f"{words(name)} over initial", f"× {_told(_gain(run, name))}", run.best.guarantee + searched
+        yield f"{words(name)} over initial", f"× {_four_digits(_gain(run, name))}", run.best.guarantee + searched
     yield "swing-up", duration(float(run.best.time[-1])), "of the best, start to goal"
-    found = run.certificates.get("000")
-    if found is None:
+    certificate = run.certificates.get("000")
+    if certificate is None:
         yield "proof", "none yet", "rtcd certify"
-    elif found.guarantee is None:
-        yield "proof", "none", f"certificate {found.verdict}"
+    elif certificate.guarantee is None:
+        yield "proof", "none", f"certificate {certificate.verdict}"
     else:
-        yield "proof", found.guarantee, "of the best's funnel"
+        yield "proof", certificate.guarantee, "of the best's funnel"
     kept = [seen.get("kept") for seen in run.verification.values()]
-    seen = ("promises kept" if all(kept) else "PROMISE BROKEN") if kept else "none yet"
+    seen = ("not refuted" if all(kept) else "REFUTED") if kept else "none yet"
     yield "verification", seen, "by independent simulators" if kept else "rtcd verify"
 
 
@@ -157,9 +157,12 @@ def _sections(runs: Sequence[Run], figures: Mapping[str, Any]) -> Iterator[str]:
     if alone is None:
         yield _section("Compared", _table(tables.comparison(runs)))
     yield _section("Funnels", *_funnels(runs, figures))
-    promise = "" if alone is None else _note(f"The best funnel is {rung(alone.best.record)}.")
-    told = "Ratios are optimal over initial. The sum counts knots, most of them near the goal: look at the inlet too."
-    yield _section("Initial and optimal", _table(tables.gains(runs)), promise, _note(told))
+    promise = "" if alone is None else _note(f"The best funnel is {guarantee(alone.best.record)}.")
+    advice = (
+        "Ratios are optimal over initial. The sum counts knots, most of them near the goal: look at the initial "
+        "ellipsoid too, that of the first knot, where disturbances come first; configurations call it the inlet."
+    )
+    yield _section("Initial and optimal", _table(tables.gains(runs)), promise, _note(advice))
     if alone:
         named = [name for name in figures if name.startswith("course")]
         boxes = "".join(_plot(name, "small") for name in named)
@@ -170,15 +173,15 @@ def _sections(runs: Sequence[Run], figures: Mapping[str, Any]) -> Iterator[str]:
             yield _section("Design and weights", f'<div class="grid">{boxes}</div>')
         yield _section("Elites", _table(tables.elites(alone)), _note("Click a heading to sort."))
     else:
-        told = "Sampled volumes, each search's own objective: solid the best so far, dotted each generation's median."
-        yield _section("Search", _plot("convergence"), _note(told))
+        legend = "Sampled volumes, each search's own objective: solid the best so far, dotted each generation's median."
+        yield _section("Search", _plot("convergence"), _note(legend))
     yield _section("Certificates", *_certified(runs))
-    seen = tables.verification(runs)
-    yield _section("Verification", _table(seen) if seen else _note("Nothing yet: rtcd verify RUN."))
+    verification = tables.verification(runs)
+    yield _section("Verification", _table(verification) if verification else _note("Nothing yet: rtcd verify RUN."))
     for run in runs:
-        for found in run.experiments:
-            name = words(found.name) if alone else f"{words(found.name)}: {run.name}"
-            yield _section(f"Disturbance: {name}", _table(tables.experiment(found)), *_pictures(found))
+        for experiment in run.experiments:
+            name = words(experiment.name) if alone else f"{words(experiment.name)}: {run.name}"
+            yield _section(f"Disturbance: {name}", _table(tables.experiment(experiment)), *_pictures(experiment))
     yield _section("Provenance", _table(tables.provenance(runs)))
 
 
@@ -199,21 +202,21 @@ def _funnels(runs: Sequence[Run], figures: Mapping[str, Any]) -> Iterator[str]:
 
 
 def _certified(runs: Sequence[Run]) -> Iterator[str]:
-    found = tables.certificates(runs)
-    if found is None:
+    certificates = tables.certificates(runs)
+    if certificates is None:
         yield _note("Nothing yet: rtcd certify RUN.")
         return
-    yield _table(found)
+    yield _table(certificates)
     for run in runs:
         ranks = tables.ranks(run)
         if ranks:
             whose = f"{run.name}: " if len(runs) > 1 else ""
-            told = f"rank correlation of sampled and shown sums over {ranks[1]} elites: {ranks[0]:.3f}"
-            yield _note(whose + told)
+            correlation = f"rank correlation of sampled and shown sums over {ranks[1]} elites: {ranks[0]:.3f}"
+            yield _note(whose + correlation)
 
 
-def _pictures(found: Experiment) -> Iterator[str]:
-    for path in found.pictures:
+def _pictures(experiment: Experiment) -> Iterator[str]:
+    for path in experiment.pictures:
         data = base64.b64encode(path.read_bytes()).decode()
         picture = f'<img src="data:image/png;base64,{data}" alt="{html.escape(words(path.stem))}">'
         yield f'<div class="scroll">{picture}</div>'
@@ -246,10 +249,10 @@ def _cell(value: Cell, numeric: bool) -> str:
     if isinstance(value, str):
         return f"<td{_LONG * (len(value) > LONGEST)}>{html.escape(value)}</td>"
     sorted_by = " data-none" if value is None else f' data-value="{value!r}"'
-    return f"<td{_NUMBER * numeric}{sorted_by}>{_told(value)}</td>"
+    return f"<td{_NUMBER * numeric}{sorted_by}>{_four_digits(value)}</td>"
 
 
-def _told(value: float | int | None) -> str:
+def _four_digits(value: float | int | None) -> str:
     return NONE if value is None else f"{value}" if isinstance(value, int) else f"{value:.4g}"
 
 

@@ -8,8 +8,8 @@ import numpy as np
 from rtcd_jax.analysis.report.canvas import BLACK, GRAY
 from rtcd_jax.analysis.report.funnels import MANY, shadow, window
 from rtcd_jax.analysis.report.history import Course, column, courses, failures, spread
-from rtcd_jax.analysis.report.progress import GREEN, SPREAD, STATUS_COLORS, told_status
-from rtcd_jax.analysis.report.reading import BLUE, VERMILION, FunnelView, Run, shown
+from rtcd_jax.analysis.report.progress import GREEN, SPREAD, STATUS_COLORS, status_words
+from rtcd_jax.analysis.report.reading import BLUE, VERMILION, FunnelView, Run, funnel_views
 from rtcd_jax.analysis.report.shapes import planes
 from rtcd_jax.analysis.report.words import letter, volume_unit, words
 from rtcd_jax.config.load import Config
@@ -23,20 +23,20 @@ POINTS = 49
 
 def plots(runs: Sequence[Run]) -> dict[str, Plot]:
     """The page's figures by name, for one run or several compared ones."""
-    config, funnels = runs[0].config, shown(runs)
+    config, funnels = runs[0].config, funnel_views(runs)
     pairs = planes(len(config.plant.states))
-    found = {f"plane{i}": plane_plot(config, funnels, plane) for i, plane in enumerate(pairs)}
-    found["levels"] = levels_plot(config, funnels)
+    figures = {f"plane{i}": plane_plot(config, funnels, plane) for i, plane in enumerate(pairs)}
+    figures["levels"] = levels_plot(config, funnels)
     if len(runs) > 1:
-        found["convergence"] = progress_plot(runs)
-        return found
+        figures["convergence"] = progress_plot(runs)
+        return figures
     if not runs[0].generations:  # nothing was searched
-        return found
-    found["convergence"] = convergence_plot(runs[0])
+        return figures
+    figures["convergence"] = convergence_plot(runs[0])
     index = _numbers(column(runs[0].generations, "index"))
     for i, course in enumerate(courses(config, runs[0].generations)):
-        found[f"course{i}"] = course_plot(course, index)
-    return found
+        figures[f"course{i}"] = course_plot(course, index)
+    return figures
 
 
 def plane_plot(config: Config, funnels: Sequence[FunnelView], plane: tuple[int, int]) -> Plot:
@@ -68,10 +68,10 @@ def levels_plot(config: Config, funnels: Sequence[FunnelView]) -> Plot:
     data = []
     for axis, values in (("y2", lambda elite: elite.rho), ("y", lambda elite: elite.volumes_per_knot)):
         for funnel in funnels:
-            told = {"name": funnel.label, "legendgroup": funnel.label, "showlegend": axis == "y2"}
+            legend = {"name": funnel.label, "legendgroup": funnel.label, "showlegend": axis == "y2"}
             line = {"x": _numbers(funnel.elite.time), "y": _numbers(values(funnel.elite)), "yaxis": axis}
             look = {"mode": "lines+markers", "line": {"color": funnel.color}, "marker": {"size": 3}}
-            data.append(told | line | look)
+            data.append(legend | line | look)
     return {
         "data": data,
         "layout": {
@@ -95,7 +95,7 @@ def convergence_plot(run: Run) -> Plot:
     for name, share in failures(generations).items():
         color = STATUS_COLORS.get(name, GRAY)
         stacked = {"stackgroup": "status", "yaxis": "y2", "fillcolor": color}
-        data.append(_line(index, share, told_status(name), color, width=0) | stacked)
+        data.append(_line(index, share, status_words(name), color, width=0) | stacked)
     data.append(_line(index, column(generations, "sigma"), "σ", BLACK) | {"yaxis": "y3", "showlegend": False})
     objective = run.config.search.objective
     unit = volume_unit(run.config, objective)
@@ -118,9 +118,9 @@ def progress_plot(runs: Sequence[Run]) -> Plot:
         legend = f"{run.name} ({words(run.config.search.objective)})"
         for name, (axis, dash, width) in SEARCHES.items():
             first, values = name == "best_so_far", column(run.generations, name)
-            told = legend if first else f"{run.name}, {words(name)}"
+            label = legend if first else f"{run.name}, {words(name)}"
             group = {"legendgroup": run.name, "showlegend": first, "yaxis": axis}
-            data.append(_line(evaluated, values, told, run.color, dash, width) | group)
+            data.append(_line(evaluated, values, label, run.color, dash, width) | group)
             volumes += [values] * (axis == "y")
     scale = _scale(np.concatenate(volumes))
     return {
@@ -233,15 +233,15 @@ def _ends(config: Config, plane: tuple[int, int]) -> list[Plot]:
 
 def _limits(config: Config, plane: tuple[int, int], view: np.ndarray) -> list[Plot]:
     """Dashed lines at the limits on |x_i| that the window shows."""
-    found = []
+    lines = []
     for axis, i in enumerate(plane):
         for value in (-config.task.state_limits[i], config.task.state_limits[i]):
             if view[0, axis] <= value <= view[1, axis]:
                 ends = {"x0": value, "x1": value, "y0": 0, "y1": 1, "xref": "x", "yref": "paper"}
                 across = {"y0": value, "y1": value, "x0": 0, "x1": 1, "yref": "y", "xref": "paper"}
                 line = {"color": GRAY, "dash": "dash", "width": 1}
-                found.append({"type": "line", "line": line} | (across if axis else ends))
-    return found
+                lines.append({"type": "line", "line": line} | (across if axis else ends))
+    return lines
 
 
 def _line(x: Sequence[Any], y: np.ndarray, name: str, color: str, dash: str = "solid", width: float = 1.8) -> Plot:

@@ -44,13 +44,13 @@ def draw_courses(run: Run) -> list[Path]:
     Raises:
         UserError: a folder that cannot be written.
     """
-    found = courses(run.config, run.generations)
-    rows = -(-len(found) // COLUMNS)
+    variables = courses(run.config, run.generations)
+    rows = -(-len(variables) // COLUMNS)
     with blank((WIDTH, 1.9 * rows + 0.4)) as figure:
         panels = figure.subplots(rows, COLUMNS, sharex=True, squeeze=False).ravel()
-        for axes, course in zip(panels, found, strict=False):
+        for axes, course in zip(panels, variables, strict=False):
             _draw_course(axes, course, column(run.generations, "index"))
-        for axes in panels[len(found) :]:
+        for axes in panels[len(variables) :]:
             axes.remove()
         handles, labels = panels[0].get_legend_handles_labels()
         figure.legend(handles, labels, loc="outside upper center", ncols=len(labels))
@@ -87,14 +87,14 @@ def _draw_statuses(axes: "Axes", index: np.ndarray, generations: Generations) ->
     shares = failures(generations)
     below = np.zeros(len(index))
     for name, share in shares.items():
-        told = {"label": told_status(name), "color": STATUS_COLORS.get(name, GRAY)}
-        axes.fill_between(index, below, below + share, step="mid", lw=0, **told)
+        look = {"label": status_words(name), "color": STATUS_COLORS.get(name, GRAY)}
+        axes.fill_between(index, below, below + share, step="mid", lw=0, **look)
         below = below + share
     axes.set(ylabel="candidates\nby status [-]", ylim=(0, 1.0))
     axes.legend(loc="lower right", ncols=len(shares), frameon=True, framealpha=0.8, edgecolor="none")
 
 
-def told_status(name: str) -> str:
+def status_words(name: str) -> str:
     """A status in words."""
     return "has a funnel" if name == "OK" else words(name).lower()
 

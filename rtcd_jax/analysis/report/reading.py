@@ -25,7 +25,7 @@ from rtcd_jax.system.console import Console, Progress, silent
 from rtcd_jax.system.errors import UserError
 from rtcd_jax.system.files import read_json, reading
 
-# Okabe and Ito's colors: told apart by all kinds of color vision.
+# Okabe and Ito's colors: distinct in all kinds of color vision.
 BLUE, VERMILION = "#0072B2", "#D55E00"
 COLORS = (VERMILION, "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
 """Of compared runs, in turn."""
@@ -120,7 +120,7 @@ class Run:
 
 
 def read_run(path: Path, console: Console | None = None) -> Run:
-    """Everything that a finished run left in its folder; its certificates are checked, and `console` told so.
+    """Everything that a finished run left in its folder; its certificates are checked, and `console` shows how far.
 
     Raises:
         UserError: no run folder, no elites yet, an elite without a funnel or with something missing, or a file that
@@ -179,19 +179,19 @@ def compared(runs: Sequence[Run]) -> list[Run]:
     """
     robots = {run.config.plant.name: run.path for run in runs}
     if len(robots) > 1:
-        told = " and ".join(f"{path} of the {robot}" for robot, path in robots.items())
-        raise UserError(f"runs of one robot can be compared, but there is {told}")
+        origins = " and ".join(f"{path} of the {robot}" for robot, path in robots.items())
+        raise UserError(f"runs of one robot can be compared, but there is {origins}")
     names = [run.name for run in runs]
-    found: list[Run] = []
+    named: list[Run] = []
     for index, run in enumerate(runs):
         name = run.name if names.count(run.name) == 1 else str(run.path)
         color = COLORS[index % len(COLORS)]
-        found.append(replace(run, name=name, labels=(f"{name}, initial", name), color=color))
-    return found
+        named.append(replace(run, name=name, labels=(f"{name}, initial", name), color=color))
+    return named
 
 
-def shown(runs: Sequence[Run]) -> list[FunnelView]:
-    """The funnels that are drawn over one another: what the runs have in common, their initial candidate, once."""
+def funnel_views(runs: Sequence[Run]) -> list[FunnelView]:
+    """The funnels that are drawn over one another; an initial candidate that runs have in common is drawn once."""
     initials: list[FunnelView] = []
     for run in runs:
         for initial in run.funnels[:-1]:
@@ -217,16 +217,16 @@ def _certificates(path: Path, console: Console) -> Iterator[tuple[str, Certifica
             continue
         found = standing(path, name, _telling(console, certificate_path(path, name)))
         with reading(summary, _ADVICE):
-            told = {"seconds": float(written["seconds"]), "sampled": _numbers(written["sampled"])}
+            beside = {"seconds": float(written["seconds"]), "sampled": _numbers(written["sampled"])}
             if found.proved:
                 shown = {"start": found.start, "intervals": found.intervals, "shown": found.volumes}
-                yield name, Certificate("proved", found.verdict, **told, **shown)
+                yield name, Certificate("proved", found.verdict, **beside, **shown)
             elif found.verdict == "refused" and written["rung"] == "certified":  # in floating-point numbers, no more
                 shown = {"start": float(written["start"]), "intervals": int(written["intervals"])}
                 shown |= {"shown": _numbers(written["found"])}
-                yield name, Certificate("certified", found.verdict, found.reason, **told, **shown)
+                yield name, Certificate("certified", found.verdict, found.reason, **beside, **shown)
             else:
-                yield name, Certificate(None, found.verdict, found.reason, **told)
+                yield name, Certificate(None, found.verdict, found.reason, **beside)
 
 
 def _numbers(written: Mapping[str, Any]) -> dict[str, float]:
@@ -235,23 +235,22 @@ def _numbers(written: Mapping[str, Any]) -> dict[str, float]:
 
 def _telling(console: Console, file: Path) -> Callable[[int, int], None]:
     """What says every second how far the checker is."""
-    told = time.monotonic()
+    last = time.monotonic()
 
     def progress(done: int, of: int) -> None:
-        nonlocal told
-        if time.monotonic() - told >= 1:
-            told = time.monotonic()
+        nonlocal last
+        if time.monotonic() - last >= 1:
+            last = time.monotonic()
             console.progress(Progress(done, of, f"checking {file}  interval {done}/{of}"))
 
     return progress
 
 
 def _experiments(folder: Path) -> list[Experiment]:
-    found = []
-    for file in sorted(folder.glob("*.json")):
-        pictures = sorted(folder.glob(f"{file.stem}*.png"))
-        found.append(Experiment(file.stem, _json(file).get("summary", {}), tuple(pictures)))
-    return found
+    return [
+        Experiment(file.stem, _json(file).get("summary", {}), tuple(sorted(folder.glob(f"{file.stem}*.png"))))
+        for file in sorted(folder.glob("*.json"))
+    ]
 
 
 def _json(path: Path) -> dict[str, Any]:

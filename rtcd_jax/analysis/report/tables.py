@@ -1,4 +1,4 @@
-"""Tables of the page: what a run found, proved, verified, and where it came from."""
+"""Tables of the page: what a run has searched, proved, verified, and where it came from."""
 
 import json
 from collections.abc import Iterator, Mapping, Sequence
@@ -28,18 +28,18 @@ class Table:
 
 
 def gains(runs: Sequence[Run]) -> Table:
-    """Table I of the paper, (initial, optimal, ratio, time), for all volumes and rungs."""
-    heads = (*_run_head(runs), "volume", "unit", "initial", "optimal", "ratio", "time", "rung")
+    """Table I of the paper, (initial, optimal, ratio, time), for all volumes and guarantees."""
+    heads = (*_run_head(runs), "volume", "unit", "initial", "optimal", "ratio", "time", "guarantee")
     return Table(heads, tuple((*_run_cell(runs, run), *row) for run in runs for row in _gains_of(run)))
 
 
 def comparison(runs: Sequence[Run]) -> Table:
-    """One row a run: what it searched, what it found, with whose proof."""
+    """One row a run: what it searched, its best candidate, with whose proof."""
     plant = runs[0].config.plant
     heads = (
         "run", "searched", *(f"{words(name)} [{unit}]" for name, unit in plant.design.items()),
         *_weight_heads(runs[0]), *(POLICY[name] for name in _searched_options(runs)), *map(words, VOLUMES),
-        "sum × initial", "rung", "sum shown", "rung shown", "promise",
+        "sum × initial", "guarantee", "sum shown", "guarantee shown", "promise",
         "time",
     )  # fmt: skip
     return Table(heads, tuple(_compared(run, _searched_options(runs)) for run in runs))
@@ -48,34 +48,48 @@ def comparison(runs: Sequence[Run]) -> Table:
 def elites(run: Run) -> Table:
     """The archive, best first."""
     plant, options = run.config.plant, _searched_options([run])
-    shown = {name: (found.shown["sum"], found.guarantee) for name, found in run.certificates.items() if found.shown}
+    shown = {
+        name: (certificate.shown["sum"], certificate.guarantee)
+        for name, certificate in run.certificates.items()
+        if certificate.shown
+    }
+    varied, compared = (any(record.get(key) for record in run.elites.values()) for key in ("spread", "mjx"))
     heads = (
         "elite", *(f"{words(name)} [{unit}]" for name, unit in plant.design.items()), *_weight_heads(run),
         *(POLICY[name] for name in options),
         *(f"{words(name)} [{volume_unit(run.config, name)}]" for name in VOLUMES), "sum × initial",
-        "largest knot [%]", "swing-up [s]", "ε", "rung", *(["sum shown", "rung shown"] if shown else []),
+        "largest knot [%]", "swing-up [s]", "ε", "guarantee", *(["spread of sum [%]"] if varied else []),
+        *(["MJX − closed form"] if compared else []), *(["sum shown", "guarantee shown"] if shown else []),
     )  # fmt: skip
     before = run.initial.volumes["sum"] if run.initial else 0.0
     rows = []
     for name, record in run.elites.items():
         volumes = record["volumes"]
         weights = (*record["weights"]["q"], *record["weights"]["r"])
-        told = (
+        row = (
             name, *record["design"].values(), *weights, *(record["policy"][name] for name in options),
             *(volumes[key] for key in VOLUMES),
             ratio(volumes["sum"], before), 100 * volumes["share_of_largest_knot"], record["duration"],
             record["epsilon"], record["rung"],
+            *([_percent(record.get("spread"))] if varied else []),
+            *([(record.get("mjx") or {}).get("difference")] if compared else []),
         )  # fmt: skip
-        rows.append((*told, *shown.get(name, (None, None))) if shown else told)
+        rows.append((*row, *shown.get(name, (None, None))) if shown else row)
     return Table(heads, tuple(rows))
+
+
+def _percent(spread: Mapping[str, Any] | None) -> float | None:
+    """The sum's relative standard deviation over the random numbers [%]; only the best elite has one."""
+    share = spread["volumes"]["sum"] if spread else None
+    return None if share is None else 100 * share
 
 
 def certificates(runs: Sequence[Run]) -> Table | None:
     """Proved volumes beside sampled ones, or why a certificate proves nothing; None where there is none."""
     heads = (
-        *_run_head(runs), "elite", "rung", "from [s]", "intervals", "proving",
-        "inlet sampled", "inlet shown", "sum sampled", "sum shown", "sum shown / sampled", "integral sampled",
-        "integral shown",
+        *_run_head(runs), "elite", "guarantee", "from [s]", "intervals", "proving",
+        "initial ellipsoid sampled", "initial ellipsoid shown", "sum sampled", "sum shown", "sum shown / sampled",
+        "integral sampled", "integral shown",
     )  # fmt: skip
     rows = tuple((*_run_cell(runs, run), *row) for run in runs for row in _certified(run))
     return Table(heads, rows) if rows else None
@@ -83,7 +97,7 @@ def certificates(runs: Sequence[Run]) -> Table | None:
 
 def ranks(run: Run) -> tuple[float, int] | None:
     """Spearman's correlation of the sampled and the shown sums and the number of elites; None below three."""
-    sums = [(found.sampled["sum"], found.shown["sum"]) for found in run.certificates.values() if found.shown]
+    sums = [(each.sampled["sum"], each.shown["sum"]) for each in run.certificates.values() if each.shown]
     if len(sums) < 3:
         return None
     from scipy.stats import spearmanr
@@ -95,16 +109,21 @@ def verification(runs: Sequence[Run]) -> Table | None:
     """What the witnesses saw; None before `rtcd verify`."""
     heads = (
         *_run_head(runs), "funnel", "witness", "states", "left funnel", "left limits", "missed goal",
-        "failure rate", "at most", "promised", "confidence", "promise",
+        "failure rate", "at least", "at most", "promised", "confidence", "promise",
     )  # fmt: skip
     rows = []
     for run in runs:
         for name, record in run.verification.items():
             for witness, seen in record.get("witnesses", {}).items():
-                counts = [seen.get(key) for key in ("left_funnel", "left_limits", "missed_goal", "rate", "rate_upper")]
-                promise = [record.get("epsilon"), record.get("confidence"), "kept" if seen.get("kept") else "BROKEN"]
+                counts = [seen.get(key) for key in ("left_funnel", "left_limits", "missed_goal")]
+                counts += [seen.get(key) for key in ("rate", "rate_lower", "rate_upper")]
+                promise = [record.get("epsilon"), record.get("confidence"), _refuted(not seen.get("kept"))]
                 rows.append((*_run_cell(runs, run), name, witness, record.get("states"), *counts, *promise))
     return Table(heads, tuple(rows)) if rows else None
+
+
+def _refuted(refuted: bool) -> str:
+    return "REFUTED" if refuted else "not refuted"
 
 
 def experiment(found: Experiment) -> Table:
@@ -123,7 +142,7 @@ def provenance(runs: Sequence[Run]) -> Table:
     return Table(heads, tuple((*_run_cell(runs, run), *row) for run in runs for row in _origin(run)))
 
 
-def told_time(run: Run) -> str | None:
+def wall_time(run: Run) -> str | None:
     """Wall time of the run, None where it was not recorded."""
     return None if run.seconds is None else duration(run.seconds)
 
@@ -135,12 +154,12 @@ def _gains_of(run: Run) -> Iterator[tuple[Cell, ...]]:
         before, after = run.initial.volumes[name] if run.initial else None, run.best.volumes[name]
         label = f"{words(name)} (searched)" if name == searched else words(name)
         times = ratio(after, before) if before is not None else None
-        yield label, volume_unit(run.config, name), before, after, times, told_time(run), run.best.guarantee
-    found = run.certificates.get("000")
+        yield label, volume_unit(run.config, name), before, after, times, wall_time(run), run.best.guarantee
+    certificate = run.certificates.get("000")
     for name in order:
-        if found and name in found.shown:
-            unit, took = volume_unit(run.config, name), duration(found.seconds)
-            yield words(name), unit, None, found.shown[name], None, took, found.guarantee
+        if certificate and name in certificate.shown:
+            unit, took = volume_unit(run.config, name), duration(certificate.seconds)
+            yield words(name), unit, None, certificate.shown[name], None, took, certificate.guarantee
 
 
 def _compared(run: Run, options: Sequence[str]) -> tuple[Cell, ...]:
@@ -154,18 +173,18 @@ def _compared(run: Run, options: Sequence[str]) -> tuple[Cell, ...]:
         *(run.best.volumes[name] for name in VOLUMES),
         ratio(run.best.volumes["sum"], before) if before is not None else None, record["rung"],
         *((found.shown["sum"], found.guarantee) if found and found.shown else (None, None)),
-        ("kept" if all(kept) else "BROKEN") if kept else None, told_time(run),
+        _refuted(not all(kept)) if kept else None, wall_time(run),
     )  # fmt: skip
 
 
 def _certified(run: Run) -> Iterator[tuple[Cell, ...]]:
-    for name, found in run.certificates.items():
-        if not found.shown:
-            yield name, f"none: {found.reason}", *[None] * 10
+    for name, certificate in run.certificates.items():
+        if not certificate.shown:
+            yield name, f"none: {certificate.reason}", *[None] * 10
             continue
-        sampled, shown = found.sampled, found.shown
+        sampled, shown = certificate.sampled, certificate.shown
         yield (
-            name, found.guarantee, found.start, found.intervals, duration(found.seconds),
+            name, certificate.guarantee, certificate.start, certificate.intervals, duration(certificate.seconds),
             sampled["inlet"], shown["inlet"], sampled["sum"], shown["sum"], ratio(shown["sum"], sampled["sum"]),
             sampled["integral"], shown["integral"],
         )  # fmt: skip
@@ -175,7 +194,7 @@ def _origin(run: Run) -> Iterator[tuple[Cell, ...]]:
     search = run.config.search
     yield "folder", str(run.path)
     yield "search", f"{search.mode}, {search.generations} generations of {search.population}, seed {search.seed}"
-    yield "time", told_time(run) or "not recorded"
+    yield "time", wall_time(run) or "not recorded"
     yield "configuration", run.provenance.get("config_hash")
     for number, start in enumerate(run.provenance.get("starts", ()), 1):
         where = f"{start.get('devices')} × {start.get('device')}, {start.get('precision')}, {start.get('system')}"
@@ -191,7 +210,7 @@ def _searched_options(runs: Sequence[Run]) -> list[str]:
 
 
 def _weight_heads(run: Run) -> list[str]:
-    return [f"{letter}{i + 1}" for letter, found in run.config.weights for i in range(len(found))]
+    return [f"{letter}{i + 1}" for letter, variables in run.config.weights for i in range(len(variables))]
 
 
 def _run_head(runs: Sequence[Run]) -> tuple[str, ...]:

@@ -1,4 +1,4 @@
-"""What figures, tables and pages have in common: names, units, numbers and rungs in words."""
+"""What figures, tables and pages have in common: names, units, numbers and guarantees in words."""
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -18,8 +18,8 @@ _POWERS = str.maketrans("0123456789", "⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 
 def words(name: str) -> str:
-    """A stored name as it is read."""
-    return name.replace("_", " ")
+    """A stored name as it is read; the inlet is the first knot's ellipsoid."""
+    return "initial ellipsoid" if name == "inlet" else name.replace("_", " ")
 
 
 def letter(name: str) -> str:
@@ -57,8 +57,8 @@ def _power(power: int) -> str:
     return "" if power == 1 else str(power).translate(_POWERS)
 
 
-def rung(record: Mapping[str, Any]) -> str:
-    """What a funnel's record promises; a volume is told with it."""
+def guarantee(record: Mapping[str, Any]) -> str:
+    """On what ground a funnel's record promises what; no volume stands without it."""
     if record["rung"] != "sampled":
         return str(record["rung"])
     return (
@@ -69,8 +69,8 @@ def rung(record: Mapping[str, Any]) -> str:
 def listed(name: str, value: float | Sequence[float], unit: str = "") -> str:
     """`pole mass = 0.2 kg`, `q = (10, 1)`."""
     numbers = [f"{number:.3g}" for number in np.atleast_1d(value)]
-    told = numbers[0] if len(numbers) == 1 else f"({', '.join(numbers)})"
-    return f"{words(name)} = {told} {unit}".rstrip()
+    values = numbers[0] if len(numbers) == 1 else f"({', '.join(numbers)})"
+    return f"{words(name)} = {values} {unit}".rstrip()
 
 
 def ratio(after: float, before: float) -> float | None:

@@ -11,18 +11,17 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Int
 
-from rtcd_jax import funnel, rollout
+from rtcd_jax import funnel
 from rtcd_jax.analysis.scale.clock import timed
 from rtcd_jax.config.load import Config
-from rtcd_jax.evaluation import make_evaluate, search_effort
+from rtcd_jax.evaluation import make_evaluate, search_budget
 from rtcd_jax.genome import decode, initial_genome
-from rtcd_jax.numerics.ellipsoid import Ellipsoids
 from rtcd_jax.policy import stabilize
 from rtcd_jax.problem import make_problem
 from rtcd_jax.run.folder import RunFolder
 from rtcd_jax.search import search
 from rtcd_jax.trajectory import plan
-from rtcd_jax.validation import confirm
+from rtcd_jax.validation import Rollouts, validate_intervals
 
 REPEATS = 3
 """Timed calls of every stage."""
@@ -42,7 +41,7 @@ class Stage(NamedTuple):
 def stages(config: Config, population: int) -> Iterator[Stage]:
     """The steps of a generation of `population` candidates whose genomes are uniform in the unit box, on one device."""
     problem = make_problem(config)
-    effort = search_effort(problem)
+    budget = search_budget(problem)
     key = jax.random.key(0)
     chunk = min(config.search.chunk, population)
 
@@ -56,21 +55,21 @@ def stages(config: Config, population: int) -> Iterator[Stage]:
         return lambda *arguments: jax.lax.map(lambda row: function(*row), arguments, batch_size=chunk)
 
     def prepared(candidate, policy):
-        sets = Ellipsoids.about(policy.trajectory.xs.T, jnp.moveaxis(policy.values, 0, -1))
-        tracked = rollout.reference(problem, candidate, policy, effort.funnel.steps)
-        return sets, sets.radii_inside(jnp.asarray(problem.state_limits)), tracked
+        rollouts = Rollouts.of(problem, candidate, policy, budget.funnel)
+        return rollouts, rollouts.sets.radii_inside(jnp.asarray(problem.state_limits))
 
     def goal(candidate, policy):
-        sets, boxes, _ = prepared(candidate, policy)
-        return funnel._goal_level(problem, candidate, policy, sets.part(slice(-1, None)), boxes[-1], key, effort)
+        rollouts, boxes = prepared(candidate, policy)
+        return funnel._goal_level(
+            problem, candidate, policy, rollouts.sets.part(slice(-1, None)), boxes[-1], key, budget
+        )
 
     def scan(candidate, policy, last):
-        sets, boxes, tracked = prepared(candidate, policy)
-        return funnel._scan_knots(problem, candidate, sets, tracked, boxes, last, key, effort)
+        rollouts, boxes = prepared(candidate, policy)
+        return funnel._scan_knots(rollouts, boxes, last, key, budget)
 
-    def fresh(candidate, policy, levels):
-        sets, _, tracked = prepared(candidate, policy)
-        return confirm(problem, candidate, sets, tracked, levels, key, effort)
+    def held_out(candidate, policy, levels):
+        return validate_intervals(Rollouts.of(problem, candidate, policy, budget.funnel), levels, key, budget)
 
     genomes = jax.random.uniform(key, (population, len(problem.free)))
     candidates = jax.vmap(partial(decode, problem))(genomes)
@@ -82,8 +81,8 @@ def stages(config: Config, population: int) -> Iterator[Stage]:
     yield Stage("goal region", *cost)
     levels, cost = measure(chunked(scan), candidates, policies, last)
     yield Stage("levels, knot by knot", *cost)
-    _, cost = measure(chunked(fresh), candidates, policies, levels)
-    yield Stage("fresh states", *cost)
+    _, cost = measure(chunked(held_out), candidates, policies, levels)
+    yield Stage("held-out samples", *cost)
     evaluation, cost = measure(make_evaluate(problem), genomes, key)
     yield Stage("all of these in one program", *cost)
 

@@ -42,7 +42,9 @@ def study(
     for index, (population, count) in enumerate(grid):
         if (population, count) not in found:
             console.message(f"population {population}, {count} devices: a process of its own, which compiles first")
-            point = mark | {"load": os.getloadavg()[0]} | _measured(path, population, count, repeats)
+            point = mark | {"load": os.getloadavg()[0]}
+            with console.waiting("compiling and measuring"):
+                point |= _measured(path, population, count, repeats)
             with writing(folder / POINTS), (folder / POINTS).open("a") as file:
                 file.write(json.dumps(plain(point)) + "\n")
             found[population, count] = point

@@ -6,11 +6,11 @@ from typing import Any, final
 
 import numpy as np
 from jaxtyping import Float, Int
-from scipy.stats import beta
 
 from rtcd_jax.elite.closed_loop import Outcome, simulate
 from rtcd_jax.elite.elite import Elite
 from rtcd_jax.elite.simulators import simulator_of, simulators_of
+from rtcd_jax.numerics.proportion import clopper_pearson
 from rtcd_jax.system.errors import UserError
 
 CHUNK = 1000
@@ -36,13 +36,13 @@ class Verification:
         """Clopper-Pearson bounds of the failure probability, each with the promise's confidence."""
         return clopper_pearson(self.failures(witness), len(self.knots), self.confidence)
 
-    def keeps(self, witness: str) -> bool:
-        """False if the failures refute the promise: then even the lower bound exceeds epsilon."""
-        return self.interval(witness)[0] <= self.epsilon
+    def refutes(self, witness: str) -> bool:
+        """Whether the failures refute the promise: then even the lower bound exceeds epsilon."""
+        return self.interval(witness)[0] > self.epsilon
 
     @property
-    def kept(self) -> bool:
-        return all(map(self.keeps, self.outcomes))
+    def refuted(self) -> bool:
+        return any(map(self.refutes, self.outcomes))
 
     @property
     def disagreements(self) -> int:
@@ -57,7 +57,7 @@ class Verification:
             "seed": self.seed,
             "epsilon": self.epsilon,
             "confidence": self.confidence,
-            "kept": self.kept,
+            "kept": not self.refuted,
             "disagreements": self.disagreements,
             "witnesses": {witness: self._record_of(witness) for witness in self.outcomes},
         }
@@ -73,16 +73,9 @@ class Verification:
             "rate": self.failures(witness) / len(self.knots),
             "rate_lower": lower,
             "rate_upper": upper,
-            "kept": self.keeps(witness),
+            "kept": not self.refutes(witness),
             "failures_per_knot": np.bincount(self.knots[outcome.failed], minlength=self.knots[-1] + 1),
         }
-
-
-def clopper_pearson(failures: int, trials: int, confidence: float) -> tuple[float, float]:
-    """Exact lower and upper bounds of a probability, each of which holds with `confidence` (one-sided)."""
-    lower = beta.ppf(1 - confidence, failures, trials - failures + 1) if failures else 0.0
-    upper = beta.ppf(confidence, failures + 1, trials - failures) if failures < trials else 1.0
-    return float(lower), float(upper)
 
 
 @final

@@ -133,12 +133,16 @@ class Loop:
         """x* and x*' at a share of the interval k."""
         return hermite(share, self.dt, self.x[k], self.rates[k, 0], self.x[k + 1], self.rates[k, 1])
 
-    def error_rate(self, k: int, share: float, error: np.ndarray) -> np.ndarray:
-        """e' = f(x* + e, u) - x*' [n D] for errors e [n D] from the nominal motion."""
+    def error_rate(self, k: int, share: float) -> Callable[[np.ndarray], np.ndarray]:
+        """Errors e [n D] from the nominal motion -> e' = f(x* + e, u) - x*' [n D], at a share of the interval k."""
         center, center_rate = self.nominal(k, share)
         gain = (1 - share) * self.gains[k] + share * self.gains[k + 1]
-        u = np.clip(self.u[k] - gain @ error, -self.limit, self.limit)
-        return self.rate(center[:, None] + error, u) - center_rate[:, None]
+
+        def rate(error: np.ndarray) -> np.ndarray:
+            u = np.clip(self.u[k] - gain @ error, -self.limit, self.limit)
+            return self.rate(center[:, None] + error, u) - center_rate[:, None]
+
+        return rate
 
     def value(self, k: int, share: float) -> tuple[np.ndarray, np.ndarray]:
         """S and S'."""
@@ -166,17 +170,17 @@ class Loop:
         """The largest V' / V over the surface V = rho, looked for from the sampled directions [n D]."""
         s, slope = self.value(k, share)
         axes, _ = self.axes(k, share, rho, 0.0)
+        error_rate = self.error_rate(k, share)
 
         def rises(y: np.ndarray) -> np.ndarray:
             error = axes @ y
-            fall = self.error_rate(k, share, error)
-            return np.sum((s @ error) * (2 * fall) + error * (slope @ error), axis=0) / rho
+            return np.sum((s @ error) * (2 * error_rate(error)) + error * (slope @ error), axis=0) / rho
 
         return _highest(rises, directions)
 
     def drift(self, k: int, share: float, axes: np.ndarray, y: np.ndarray) -> np.ndarray:
         """y'L^-1 (f(x* + L y, u) - x*') [D] for directions y [n D] of an ellipsoid L."""
-        return np.sum(y * np.linalg.solve(axes, self.error_rate(k, share, axes @ y)), axis=0)
+        return np.sum(y * np.linalg.solve(axes, self.error_rate(k, share)(axes @ y)), axis=0)
 
     def rooms(self, k: int, share: float) -> np.ndarray:
         """The half widths [n] that the limits on the states leave to an ellipsoid."""

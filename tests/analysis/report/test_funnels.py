@@ -1,4 +1,4 @@
-"""What the figures draw is what the run folder holds: shadows of ellipsoids, volumes with their rung."""
+"""What the figures draw is what the run folder holds: shadows of ellipsoids, volumes with their guarantee."""
 
 import numpy as np
 import pytest
@@ -88,7 +88,7 @@ def test_state_limits_are_drawn_where_the_window_shows_them(tmp_path, figures, l
     assert {(line.get_xdata()[0], line.get_ydata()[0]) for line in lines(axes, "state limit")} == visible
 
 
-def test_volumes_are_drawn_over_time_and_told_with_their_rung(run, figures):
+def test_volumes_are_drawn_over_time_with_their_guarantee(run, figures):
     folder, config = run
     draw_funnels(read_run(folder))
     (axes,) = [axes for axes in figures[0].axes if axes.get_yscale() == "log"]
@@ -101,16 +101,16 @@ def test_volumes_are_drawn_over_time_and_told_with_their_rung(run, figures):
     }[config.plant.name]
     told = [text.get_text() for text in figures[0].legends[-1].get_texts()]
     for text, label, scale in zip(told, ("initial", "best"), (1, 3), strict=True):
-        volumes, rung = text.split("\n")
+        volumes, guarantee = text.split("\n")
         assert volumes == (
             f"{label}: sum {111 * scale} {unit}, integral {22 * scale} {integral}, "
-            f"inlet {0.3 * scale:.4g} {unit}, geometric mean {4 * scale} {unit}"
+            f"initial ellipsoid {0.3 * scale:.4g} {unit}, geometric mean {4 * scale} {unit}"
         )
-        assert rung == "sampled: failure probability at each knot ≤ 0.0023 with confidence 0.99"
-    assert axes.get_title() == "best over initial: sum × 3, integral × 3, inlet × 3, geometric mean × 3"
+        assert guarantee == "sampled: failure probability at each knot ≤ 0.0023 with confidence 0.99"
+    assert axes.get_title() == "best over initial: sum × 3, integral × 3, initial ellipsoid × 3, geometric mean × 3"
 
 
-def test_a_higher_rung_is_told_by_its_name(tmp_path, figures):
+def test_a_higher_guarantee_stands_by_its_name(tmp_path, figures):
     config = experiment()
     draw_funnels(read_run(run_folder(tmp_path / "run", config, best=candidate(config, rung="certified"))))
     assert "\ncertified\n" in texts(figures[0]) + "\n"
@@ -178,5 +178,7 @@ def test_compared_funnels_lie_over_one_another_the_largest_lowest(tmp_path, figu
     (axes,) = panels(figures[0])
     drawn = [line.get_label() for line in axes.lines if not line.get_label().startswith(("start", "goal", "state"))]
     assert drawn == ["rtcd", "rtc", "initial"]
-    assert "rtc: sum 222, integral 44, inlet 0.6, geometric mean 8 (sampled, ε = 0.0023)" in texts(figures[0])
+    assert "rtc: sum 222, integral 44, initial ellipsoid 0.6, geometric mean 8 (sampled, ε = 0.0023)" in texts(
+        figures[0]
+    )
     assert "volumes in rad²/s, integrals in rad²" in texts(figures[0])

@@ -149,7 +149,7 @@ def test_a_page_that_is_there_is_brought_up_to_date_and_none_is_made(tmp_path):
     verify_and_disturb(run)
     assert refresh(run) == run / "report.html"
     assert (run / "report.html").read_text() == render([read_run(run)])
-    assert "promises kept" in (run / "report.html").read_text()
+    assert "not refuted" in (run / "report.html").read_text()
     assert not (run / "figures").exists()
 
 

@@ -39,7 +39,7 @@ def test_what_the_checker_accepts_is_proved(run):
     text = render([read_run(run)])
     (row,) = rows(tables.certificates([read_run(run)]))
     assert "<strong>proved</strong><small>of the best&#x27;s funnel</small>" in text
-    assert (row["rung"], row["from [s]"], row["intervals"]) == ("proved", 0.0, 4)
+    assert (row["guarantee"], row["from [s]"], row["intervals"]) == ("proved", 0.0, 4)
 
 
 def test_proved_volumes_are_the_checker_s_not_the_summary_s(run):
@@ -80,11 +80,11 @@ def test_what_the_checker_does_not_accept_for_this_elite_is_not_proved(run, verd
     text = render([found])
     (row,) = rows(tables.certificates([found]))
     assert f"<strong>none</strong><small>certificate {verdict}</small>" in text
-    assert row["rung"].startswith("none: ")
+    assert row["guarantee"].startswith("none: ")
     assert row["sum shown"] is None
     assert ">proved<" not in text
     assert "sum shown" not in tables.elites(found).heads
-    assert {row["rung"] for row in rows(tables.gains([found]))} == {"sampled"}
+    assert {row["guarantee"] for row in rows(tables.gains([found]))} == {"sampled"}
     assert "proved" not in rows(tables.comparison([found]))[0].values()
 
 
@@ -95,10 +95,10 @@ def test_what_floating_point_numbers_show_stays_certified_while_the_file_is_whol
     summary.write_text(json.dumps(told))
     BREAKS["refused"](run)
     (row,) = rows(tables.certificates([read_run(run)]))
-    assert (row["rung"], row["sum shown"]) == ("certified", told["000"]["found"]["sum"])
+    assert (row["guarantee"], row["sum shown"]) == ("certified", told["000"]["found"]["sum"])
     BREAKS["missing"](run)
     (row,) = rows(tables.certificates([read_run(run)]))
-    assert row["rung"].startswith("none: ")
+    assert row["guarantee"].startswith("none: ")
 
 
 @pytest.mark.parametrize("entry", [{}, 3, {"seconds": "x", "sampled": {}}, {"seconds": 1, "sampled": {"sum": []}}])

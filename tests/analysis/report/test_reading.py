@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import pytest
 
-from rtcd_jax.analysis.report.reading import compared, read_run, shown
+from rtcd_jax.analysis.report.reading import compared, funnel_views, read_run
 from rtcd_jax.system.errors import UserError
 from tests.analysis.report.runs import (
     VERIFICATION,
@@ -40,12 +40,12 @@ def test_a_funnel_that_runs_share_is_shown_once(tmp_path):
     """Its levels differ a little from run to run, since every run samples them with its own seed."""
     first, second = (read_run(finished(tmp_path / name)) for name in ("rtc", "rtcd"))
     second = replace(second, initial=replace(second.initial, rho=1.01 * second.initial.rho))
-    assert [funnel.label for funnel in shown(compared([first, second]))] == ["initial", "rtc", "rtcd"]
+    assert [funnel.label for funnel in funnel_views(compared([first, second]))] == ["initial", "rtc", "rtcd"]
     config = experiment()
     other = run_folder(tmp_path / "other", config, candidate(config, 5), candidate(config, 1))
     runs = compared([first, read_run(other)])
-    assert [funnel.label for funnel in shown(runs)] == ["rtc, initial", "other, initial", "rtc", "other"]
-    assert len({funnel.color for funnel in shown(runs)}) == 4
+    assert [funnel.label for funnel in funnel_views(runs)] == ["rtc, initial", "other, initial", "rtc", "other"]
+    assert len({funnel.color for funnel in funnel_views(runs)}) == 4
 
 
 def test_runs_of_one_name_are_told_by_their_paths(tmp_path):

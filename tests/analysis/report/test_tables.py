@@ -1,4 +1,4 @@
-"""The tables' numbers are the run's, each beside its rung."""
+"""The tables' numbers are the run's, each beside its guarantee."""
 
 import json
 import math
@@ -26,19 +26,19 @@ def rows(table):
     return [dict(zip(table.heads, row, strict=True)) for row in table.rows]
 
 
-def test_table_one_has_initial_optimal_ratio_and_time_with_every_number_s_rung(tmp_path):
+def test_table_one_has_initial_optimal_ratio_and_time_with_every_number_s_guarantee(tmp_path):
     folder = finished(tmp_path / "run")
     (folder / "provenance.json").write_text(json.dumps({"starts": [{"seconds": 133.0}]}))
     first, *others = rows(tables.gains([proved(folder)]))
     assert first == {
         "volume": "sum (searched)", "unit": "rad²/s", "initial": 111.0, "optimal": 333.0, "ratio": 3.0,
-        "time": "2 min 13 s", "rung": "sampled",
+        "time": "2 min 13 s", "guarantee": "sampled",
     }  # fmt: skip
     assert [row["volume"] for row in others] == [
-        "integral", "inlet", "geometric mean", "sum", "integral", "inlet",
+        "integral", "initial ellipsoid", "geometric mean", "sum", "integral", "initial ellipsoid",
     ]  # fmt: skip
     shown = others[3]
-    assert (shown["optimal"], shown["rung"], shown["time"]) == (330.0, "proved", "7.25 s")
+    assert (shown["optimal"], shown["guarantee"], shown["time"]) == (330.0, "proved", "7.25 s")
     assert shown["initial"] is shown["ratio"] is None
 
 
@@ -49,7 +49,7 @@ def test_without_an_initial_funnel_there_is_no_ratio(tmp_path):
     assert rows(tables.elites(run))[0]["sum × initial"] is None
 
 
-def test_elites_are_told_with_designs_weights_volumes_and_rung(tmp_path):
+def test_elites_are_told_with_designs_weights_volumes_and_guarantee(tmp_path):
     config = experiment()
     folder = run_folder(
         tmp_path / "run", config, candidate(config), [candidate(config, 1, 3.0), candidate(config, 2, 2.0)]
@@ -59,10 +59,22 @@ def test_elites_are_told_with_designs_weights_volumes_and_rung(tmp_path):
     assert (first["mass [kg]"], first["q1"], first["q2"], first["r1"]) == (0.7, 10, 1, 0.1)
     assert (first["sum [rad²/s]"], second["sum [rad²/s]"]) == (333, 222)
     assert (first["sum × initial"], second["sum × initial"]) == (3, 2)
-    assert {row["rung"] for row in (first, second)} == {"sampled"}
+    assert {row["guarantee"] for row in (first, second)} == {"sampled"}
     assert "sum shown" not in first
     first, second = rows(tables.elites(proved(folder)))
-    assert (first["sum shown"], first["rung shown"], second["sum shown"]) == (330.0, "proved", None)
+    assert (first["sum shown"], first["guarantee shown"], second["sum shown"]) == (330.0, "proved", None)
+
+
+def test_elites_tell_their_spread_and_what_mjx_saw(tmp_path):
+    config = experiment()
+    folder = run_folder(tmp_path / "run", config, candidate(config), [candidate(config), candidate(config, 1)])
+    assert not {"spread of sum [%]", "MJX − closed form"} & rows(tables.elites(read_run(folder)))[0].keys()
+    best = folder / "elites" / "000.json"
+    found = {"spread": {"keys": 5, "volumes": {"sum": 0.004}}, "mjx": {"difference": 2e-12}}
+    best.write_text(json.dumps(json.loads(best.read_text()) | found))
+    first, second = rows(tables.elites(read_run(folder)))
+    assert (first["spread of sum [%]"], first["MJX − closed form"]) == (0.4, 2e-12)
+    assert (second["spread of sum [%]"], second["MJX − closed form"]) == (None, None)
 
 
 def test_certificates_stand_beside_what_was_sampled(tmp_path):
@@ -71,9 +83,9 @@ def test_certificates_stand_beside_what_was_sampled(tmp_path):
     (folder / "certificates").mkdir()
     (folder / "certificates" / "summary.json").write_text('{"001": null}')
     first, second = rows(tables.certificates([proved(folder, **read_run(folder).certificates)]))
-    assert (first["sum sampled"], first["sum shown"], first["rung"]) == (333, 330, "proved")
+    assert (first["sum sampled"], first["sum shown"], first["guarantee"]) == (333, 330, "proved")
     assert math.isclose(first["sum shown / sampled"], 330 / 333)
-    assert second["rung"] == "none: no goal region could be shown"
+    assert second["guarantee"] == "none: no goal region could be shown"
 
 
 @pytest.mark.parametrize(
@@ -93,7 +105,7 @@ def test_verification_tells_what_each_witness_saw(tmp_path):
     folder = finished(tmp_path / "run")
     assert tables.verification([read_run(folder)]) is None
     (row,) = rows(tables.verification([read_run(verify_and_disturb(folder))]))
-    assert (row["funnel"], row["witness"], row["states"], row["promise"]) == ("000", "C MuJoCo", 1020, "kept")
+    assert (row["funnel"], row["witness"], row["states"], row["promise"]) == ("000", "C MuJoCo", 1020, "not refuted")
     assert (row["at most"], row["promised"], row["confidence"]) == (0.0045, 0.0043, 0.99)
 
 
@@ -117,7 +129,7 @@ def test_runs_are_compared_row_by_row(tmp_path):
     first, second = rows(tables.comparison(compared([proved(folders[0]), read_run(folders[1])])))
     assert (first["run"], first["sum"], first["sum × initial"], first["sum shown"]) == ("rtc", 222, 2, 330)
     assert (second["run"], second["sum"], second["sum × initial"], second["sum shown"]) == ("rtcd", 555, 5, None)
-    assert (first["promise"], second["promise"]) == ("kept", None)
+    assert (first["promise"], second["promise"]) == ("not refuted", None)
 
 
 def test_provenance_names_configuration_and_starts(tmp_path):

@@ -1,0 +1,172 @@
+"""The second, more thorough evaluation of elites and initial candidate, from which alone numbers are reported.
+
+One fixed key in every run: a candidate has the same numbers in every run. Further keys say by how much the estimate of
+the best and of the initial candidate varies; MJX follows held-out samples of all of them to the goal as well.
+"""
+
+from collections.abc import Callable, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from functools import partial
+from typing import Any, Generic, NamedTuple, TypeVar, final
+
+import jax
+import numpy as np
+
+from rtcd_jax.evaluation import compare_with_mjx, elite_budget, elite_key, resample
+from rtcd_jax.problem import Problem
+from rtcd_jax.system.cluster import Cluster
+from rtcd_jax.system.console import Console
+from rtcd_jax.system.errors import UserError
+from rtcd_jax.types import Evaluation, Status
+from rtcd_jax.validation import PhysicsComparison
+
+TOLERANCE = 1e-6
+"""Largest difference of MJX and the closed form, in radii of the ellipsoid; rounding alone leaves less than 1e-9."""
+
+Job = tuple[Evaluation, jax.Array, int]
+"""A candidate, its random numbers, and its held-out samples at each knot."""
+Result = TypeVar("Result")
+
+
+@final
+class Reported(NamedTuple):
+    """A candidate as it is stored: its evaluation, those under further keys, and MJX beside the closed form."""
+
+    evaluation: Evaluation
+    others: Sequence[Evaluation]
+    physics: PhysicsComparison | None
+
+
+@final
+class Reevaluation:
+    """Its programs compile beside the search's own, from when this is made."""
+
+    def __init__(self, problem: Problem, cluster: Cluster, population: Evaluation, console: Console):
+        self._elites, self._key = problem.config.elites, elite_key()
+        self._cluster, self._console = cluster, console
+        self._looks = problem.config.search.generations
+        self._budget = elite_budget(problem)
+        self._resample = _OnDevices(partial(resample, problem, self._budget), cluster, population)
+        if self._elites.mjx_states:
+            compare = lambda evaluation, key, _: compare_with_mjx(problem, evaluation, key)  # noqa: E731
+            self._compare = _OnDevices(compare, cluster, population)
+
+    def sample(self, evaluations: Sequence[Evaluation]) -> list[Evaluation]:
+        """Each with its funnel sampled again, all by the same random numbers. Raises Preempted, as all methods."""
+        jobs = [(evaluation, self._key, self._budget.samples_per_knot) for evaluation in evaluations]
+        return self._resample(jobs, self._tell("funnels sampled again", len(jobs)))
+
+    def report(self, elites: Sequence[Evaluation], initial: Evaluation) -> tuple[list[Reported], Reported]:
+        """What is stored of the elites, best first, and of the initial candidate.
+
+        Raises:
+            UserError: MJX and the closed form differ.
+        """
+        candidates = [*elites, initial]
+        physics = self._compared(candidates)
+        others: list[Sequence[Evaluation]] = [[] for _ in candidates]
+        others[0], others[-1] = self._repeated([elites[0], initial])
+        *reported, last = map(Reported, candidates, others, physics)
+        return reported, last
+
+    def _repeated(self, evaluations: Sequence[Evaluation]) -> list[list[Evaluation]]:
+        """Each under the further keys, with the held-out samples of the first rounds alone: by more of them the levels
+        vary less, so that the spread is rather overestimated.
+        """
+        count = self._elites.keys
+        keys = [jax.random.fold_in(self._key, index) for index in range(count)]
+        jobs = [(evaluation, key, self._budget.funnel.trials) for evaluation in evaluations for key in keys]
+        results = self._resample(jobs, self._tell("funnels sampled by further keys", len(jobs)))
+        return [results[k * count : (k + 1) * count] for k in range(len(evaluations))]
+
+    def _compared(self, evaluations: Sequence[Evaluation]) -> list[PhysicsComparison | None]:
+        """None for what has no funnel."""
+        comparisons: list[PhysicsComparison | None] = [None] * len(evaluations)
+        if not self._elites.mjx_states:
+            return comparisons
+        rows = [k for k, evaluation in enumerate(evaluations) if int(evaluation.status) == Status.OK]
+        key = jax.random.fold_in(self._key, self._elites.keys)
+        jobs = [(evaluations[k], key, self._elites.mjx_states) for k in rows]
+        for k, comparison in zip(rows, self._compare(jobs, self._tell("funnels under MJX", len(jobs))), strict=True):
+            require_equal_physics(comparison)
+            comparisons[k] = comparison
+        return comparisons
+
+    def _tell(self, what: str, count: int) -> Callable[[int], None]:
+        def tell(done: int) -> None:
+            self._looks += 1
+            self._cluster.look(self._looks)
+            if done:
+                self._console.message(f"{what}: {done} of {count}")
+
+        return tell
+
+
+def require_equal_physics(comparison: PhysicsComparison) -> None:
+    """Raises UserError, which names the state, if MJX and the closed form differ by more than TOLERANCE."""
+    if not comparison.difference <= TOLERANCE:
+        start, closed_form, mjx = (
+            np.array2string(np.asarray(state), precision=9, separator=", ", max_line_width=1000)
+            for state in (comparison.start, comparison.closed_form, comparison.mjx)
+        )
+        raise UserError(
+            f"MJX and the closed form differ by {float(comparison.difference):.2g} radii of the ellipsoid (must be <= "
+            f"{TOLERANCE:g}): the state {start} of knot {int(comparison.knot)} is at {closed_form} by the closed form "
+            f"and at {mjx} by MJX at t = {float(comparison.time):.4g} s: the MJCF or the plant's equations are wrong"
+        )
+
+
+def physics_line(comparisons: Sequence[PhysicsComparison]) -> str:
+    """What MJX says of all candidates, in one line."""
+    states = sum(int(comparison.states) for comparison in comparisons)
+    failures = sum(int(comparison.failures) for comparison in comparisons)
+    difference = max(float(comparison.difference) for comparison in comparisons)
+    return (
+        f"MJX: {states} held-out samples of {len(comparisons)} funnels followed to the goal, {failures} failed; "
+        f"largest |MJX - closed form| {difference:.1g} of an ellipsoid's radius"
+    )
+
+
+@final
+class _OnDevices(Generic[Result]):
+    """`verb(evaluation, key, samples) -> result`, jitted for one candidate on every device at a time."""
+
+    def __init__(self, verb: Callable[[Evaluation, jax.Array, Any], Result], cluster: Cluster, population: Evaluation):
+        self._cluster = cluster
+        pool = ThreadPoolExecutor(1)
+        self._program: Future[jax.stages.Compiled] = pool.submit(self._compile, verb, population)
+        pool.shutdown(wait=False)
+
+    def _compile(
+        self, verb: Callable[[Evaluation, jax.Array, Any], Result], population: Evaluation
+    ) -> jax.stages.Compiled:
+        def one(jobs, _):
+            evaluation, key, samples = row(jobs, 0)
+            result = verb(evaluation, jax.random.wrap_key_data(key), samples)
+            return jax.tree.map(lambda leaf: leaf[None], result)
+
+        blank = jax.tree.map(lambda leaf: np.zeros(leaf.shape[1:], leaf.dtype), population)
+        jobs = self._split([(blank, jax.random.key(0), 1)] * len(self._cluster.devices))
+        return self._cluster.shared(one).lower(jobs, ()).compile()
+
+    def _split(self, jobs: Sequence[Job]) -> Any:
+        rows = [(evaluation, jax.random.key_data(key), np.asarray(samples)) for evaluation, key, samples in jobs]
+        return self._cluster.split(jax.tree.map(lambda *leaves: np.stack(leaves), *rows))
+
+    def __call__(self, jobs: Sequence[Job], tell: Callable[[int], None]) -> list[Result]:
+        """The jobs' results; `tell` hears how many are done before each round over the devices and after the last."""
+        devices = len(self._cluster.devices)
+        results: list[Result] = []
+        while len(results) < len(jobs):
+            tell(len(results))
+            batch = [*jobs[len(results) : len(results) + devices]]
+            filled = batch + batch[-1:] * (devices - len(batch))
+            rows = self._cluster.gathered(self._program.result()(self._split(filled), ()))
+            results += [row(rows, k) for k in range(len(batch))]
+        tell(len(results))
+        return results
+
+
+def row(tree: Any, index: int) -> Any:
+    """One entry of the leading axis of all leaves."""
+    return jax.tree.map(lambda leaf: leaf[index], tree)
