@@ -208,11 +208,19 @@ def test_a_rail_that_is_left_is_told(tmp_path):
     assert 0 < shares[0] < 1
 
 
+def test_an_integrated_s_that_is_not_quite_symmetric_is_its_symmetric_part(tmp_path):
+    trajectory, funnel = pair(tmp_path)
+    off = np.array([0, 0, 1e-3, -1e-3, 0])[:, None]
+    np.savetxt(funnel, np.loadtxt(funnel, delimiter=",", skiprows=1) + off, delimiter=",")
+    external = read_external(trajectory, "pendulum", swing.PARAMETERS, funnel)
+    np.testing.assert_allclose(external.S, swing.elite()[0]["S"], rtol=1e-12)
+
+
 @pytest.mark.parametrize(
     ("change", "reason"),
     [
         (lambda rows: rows[:, :-1], "has 5 rows of 4 numbers: must have 5 rows"),
-        (lambda rows: rows * [[1], [1], [1.1], [1], [1]], "an S is not symmetric"),
+        (lambda rows: rows + 0.1 * rows.max() * np.eye(5)[2][:, None], "an S is not symmetric"),
         (lambda rows: rows * [[-1], [1], [1], [1], [1]], "rho of knot 0 must be positive"),
     ],
 )

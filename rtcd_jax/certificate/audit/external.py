@@ -21,8 +21,8 @@ from rtcd_jax.system.errors import UserError, closest, printable
 
 EVEN = 1e-6
 """Share of an interval by which the knots' times may be off an even grid."""
-SYMMETRIC = 1e-6
-"""Share of S's largest entry by which it may be asymmetric."""
+SYMMETRIC = 0.05
+"""Share of its largest entry by which S may be asymmetric, as integrated ones are; V has its symmetric part only."""
 SMALLEST, LARGEST = 1e-12, 1e12
 """Ends of the numbers that a robot, a cost or a table may have [SI units]."""
 DAMPINGS = {"b", "Beq", "Bp"}
@@ -154,13 +154,17 @@ def _levels_and_values(path: Path, knots: int, n: int) -> tuple[np.ndarray, np.n
     """rho [knots] and S [knots n n] of a file with a knot a column, or a knot a row: rho, then S row by row."""
     found = _matrix(path, f"a funnel file: rho and the {n * n} entries of S of every knot")
     size = 1 + n * n
-    for numbers in (found.T, found):
+    read = []
+    for numbers in (found.T, found):  # where both fit, the one whose S is symmetric, else a knot a column
         if numbers.shape == (knots, size):
             s = numbers[:, 1:].reshape(knots, n, n)
-            if np.allclose(s, np.swapaxes(s, 1, 2), rtol=SYMMETRIC, atol=SYMMETRIC * np.abs(s).max()):
-                return numbers[:, 0], (s + np.swapaxes(s, 1, 2)) / 2
-    if (knots, size) in (found.shape, found.T.shape):
-        raise UserError(f"{path}: an S is not symmetric")
+            asymmetry = np.max(np.abs(s - np.swapaxes(s, 1, 2))) / max(np.max(np.abs(s)), SMALLEST)
+            read.append((asymmetry, numbers[:, 0], (s + np.swapaxes(s, 1, 2)) / 2))
+    if read:
+        asymmetry, rho, s = min(read, key=lambda each: each[0] > EVEN)
+        if asymmetry <= SYMMETRIC:
+            return rho, s
+        raise UserError(f"{path}: an S is not symmetric, by {asymmetry:.1%} of the largest entry")
     raise UserError(
         f"{path} has {found.shape[0]} rows of {found.shape[1]} numbers: must have {size} rows (rho, S row by row) of "
         f"{knots} numbers, one for each knot of the trajectory, or {knots} rows of {size}"
