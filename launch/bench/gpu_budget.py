@@ -80,24 +80,21 @@ class Thunk:
 def thunks(text: str) -> Thunk:
     """The tree of the sequence that XLA prints."""
     root = Thunk("root", -1)
-    path, into_condition = [root], {}
+    path, in_condition = [root], set()
     for line in filter(str.strip, text.splitlines()):
         indent, words = len(line) - len(line.lstrip()), line.strip()
-        if words in ("condition:", "body:"):
-            loop = [thunk for thunk in path if thunk.kind == "kWhile"]
-            while loop and loop[-1].indent > indent:
-                loop.pop()
-            into_condition[id(loop[-1])] = words == "condition:"
-            del path[path.index(loop[-1]) + 1 :]
-            continue
-        match = re.match(r"\d+: (k\w+)", words)
-        if not match:
-            continue
-        while path[-1].indent >= indent:
-            path.pop()
-        thunk = Thunk(match[1], indent)
-        (path[-1].condition if into_condition.get(id(path[-1])) else path[-1].body).append(thunk)
-        path.append(thunk)
+        if words == "condition:":  # of the loop just above, whatever its own indent
+            in_condition.add(id(path[-1]))
+        elif words == "body:":  # two columns right of its loop
+            while path[-1].indent > indent - 2:
+                path.pop()
+            in_condition.discard(id(path[-1]))
+        elif match := re.match(r"\d+: (k\w+)", words):
+            while path[-1].indent >= indent:
+                path.pop()
+            thunk = Thunk(match[1], indent)
+            (path[-1].condition if id(path[-1]) in in_condition else path[-1].body).append(thunk)
+            path.append(thunk)
     return root
 
 
@@ -161,6 +158,9 @@ class Frames:
 def counted(root: Thunk, trips: dict[str, float]) -> Counter:
     """Kernels and copies, graphs, syncs with the host, and slices in loops outside of graphs, of one chunk."""
 
+    def branches(loop: Thunk) -> list[Thunk]:
+        return [child for child in loop.body if child.kind == "kConditional"]
+
     def of(thunk: Thunk, in_graph: bool, in_loop: bool) -> Counter:
         total = Counter()
         for child in thunk.body:
@@ -171,8 +171,10 @@ def counted(root: Thunk, trips: dict[str, float]) -> Counter:
                 body, condition = of(child, in_graph, True), of(Thunk("", 0, child.condition), in_graph, True)
                 once = body + condition + Counter(syncs=int(not in_graph and child.trips is None))
                 total += Counter({name: count * times for name, count in once.items()})
+                for branch in branches(child):  # the lanes' refill: all lanes are filled once, and emptied once
+                    total += of(branch, in_graph, True)
             elif child.kind == "kConditional":
-                total += of(child, in_graph, in_loop) + Counter(syncs=int(not in_graph))
+                total += Counter(syncs=int(not in_graph))
             else:
                 total["launches"] += 1
                 total["outside"] += not in_graph
