@@ -9,10 +9,10 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from rtcd_jax.analysis.disturb.comparison import Contest, Meter, motions, read_contest, run
-from rtcd_jax.analysis.disturb.experiments import FACTORS, SIZES, TIMES, impulse, off_nominal, robustness, troubles
+from rtcd_jax.analysis.disturb.comparison import Comparison, Meter, motions, read_comparison, run
+from rtcd_jax.analysis.disturb.experiments import FACTORS, SIZES, TIMES, impulse, off_nominal, perturbations, robustness
 from rtcd_jax.analysis.disturb.figures import draw_disturbance
-from rtcd_jax.analysis.disturb.scenarios import Lanes, Outcome
+from rtcd_jax.analysis.disturb.scenarios import Outcome, Rollouts
 from rtcd_jax.system.console import Console
 from rtcd_jax.system.files import make_folder, replace_json
 
@@ -25,45 +25,45 @@ def disturb_run(folder: Path, states: int, seed: int, console: Console) -> None:
     Raises:
         UserError: no run folder, a run without elites, or a folder that cannot be read or written.
     """
-    contest = read_contest(folder, console)
+    comparison = read_comparison(folder, console)
     place = folder / FOLDER
     make_folder(place)
-    meter = Meter(console, _all_motions(contest, states))
+    meter = Meter(console, _all_motions(comparison, states))
 
-    def simulate(lanes: Lanes, experiment: str, settles: bool) -> Outcome:
-        return run(contest, lanes, seed, experiment, meter, settles)
+    def simulate(rollouts: Rollouts, experiment: str, settles: bool) -> Outcome:
+        return run(comparison, rollouts, seed, experiment, meter, settles)
 
     records = {
-        "off_nominal": off_nominal(contest, states, seed, simulate),
-        "impulse": impulse(contest, simulate),
-        "robustness": robustness(contest, seed, simulate),
+        "off_nominal": off_nominal(comparison, states, seed, simulate),
+        "impulse": impulse(comparison, simulate),
+        "robustness": robustness(comparison, seed, simulate),
     }
-    of_run = {"config_hash": contest.config_hash, "plant": contest.elites[0].plant}
+    of_run = {"config_hash": comparison.config_hash, "plant": comparison.elites[0].plant}
     for name, record in records.items():
         replace_json(place / f"{name}.json", of_run | record)
     pictures = draw_disturbance(folder)
-    for line in _summary(contest, records):
+    for line in _summary(comparison, records):
         console.message(line)
     console.message(f"{len(records)} records and {len(pictures)} figures in {place}")
 
 
-def _all_motions(contest: Contest, states: int) -> int:
-    loops = len(contest.names)
-    robust = sum(len(trouble.levels) * trouble.repeats for trouble in troubles(contest))
+def _all_motions(comparison: Comparison, states: int) -> int:
+    loops = len(comparison.names)
+    robust = sum(len(perturbation.levels) * perturbation.repeats for perturbation in perturbations(comparison))
     return sum(map(motions, (len(FACTORS) * loops**2 * states, loops * TIMES * SIZES, loops * robust)))
 
 
-def _summary(contest: Contest, records: Mapping[str, Mapping[str, Any]]) -> Iterator[str]:
+def _summary(comparison: Comparison, records: Mapping[str, Mapping[str, Any]]) -> Iterator[str]:
     off, push, robust = (records[name]["summary"] for name in ("off_nominal", "impulse", "robustness"))
-    heading = "".join(f"{name:>12}" for name in contest.names)
+    heading = "".join(f"{name:>12}" for name in comparison.names)
     yield f"{'arrived from (sampled)':30}{heading}"
     for place, shares in off.items():
-        yield f"  {place:28}" + "".join(f"{shares[name]:12.1%}" for name in contest.names)
+        yield f"  {place:28}" + "".join(f"{shares[name]:12.1%}" for name in comparison.names)
     yield f"{'pushes':30}{heading}"
-    yield f"{'  recovered':30}" + "".join(f"{push[name]['recovered']:12.1%}" for name in contest.names)
-    largest = "".join(f"{push[name]['largest_at_all_times']:12.3g}" for name in contest.names)
-    yield f"{f'  all borne up to [{contest.plant.input_units[0]} s]':30}{largest}"
+    yield f"{'  recovered':30}" + "".join(f"{push[name]['recovered']:12.1%}" for name in comparison.names)
+    largest = "".join(f"{push[name]['largest_at_all_times']:12.3g}" for name in comparison.names)
+    yield f"{f'  all tolerated up to [{comparison.plant.input_units[0]} s]':30}{largest}"
     yield f"{'robustness':30}{heading}"
-    for criterion in robust[contest.names[0]]:
-        shares = "".join(f"{robust[name][criterion]:12.1%}" for name in contest.names)
+    for criterion in robust[comparison.names[0]]:
+        shares = "".join(f"{robust[name][criterion]:12.1%}" for name in comparison.names)
         yield f"  {criterion:28}{shares}"

@@ -1,4 +1,4 @@
-"""The controllers that are compared, and what runs their lanes in batches, with progress."""
+"""The controllers that are compared, and their rollouts in batches, with progress."""
 
 import math
 from collections.abc import Iterator
@@ -14,9 +14,9 @@ from rtcd_jax.analysis.disturb.scenarios import (
     CHUNK,
     STEP,
     WATCHED,
-    Lanes,
     Loops,
     Outcome,
+    Rollouts,
     advance,
     start,
     steps_of,
@@ -29,7 +29,7 @@ from rtcd_jax.plants.base import Plant
 from rtcd_jax.system.console import Clock, Console, Progress, times
 
 BATCH = 2048
-"""Lanes in the compiled program."""
+"""Rollouts in the compiled program."""
 TELLING = 0.02
 """Share of the work from which on the time that is left can be told; before it, most was compilation."""
 REPORTED = 5.0
@@ -38,7 +38,7 @@ REPORTED = 5.0
 
 @final
 @dataclass(frozen=True, eq=False)
-class Contest:
+class Comparison:
     """C closed loops of one run, by name; `plant` and `design` have leaves [C]; `horizon` [s] is for all motions.
 
     `config_hash` is that of the run.
@@ -77,7 +77,7 @@ class Meter:
             self._console.progress(Progress(share, 1, f"{experiment:12} {share:4.0%}  {shown}"))
 
 
-def read_contest(folder: Path, console: Console) -> Contest:
+def read_comparison(folder: Path, console: Console) -> Comparison:
     """The initial candidate beside the best elite of a run folder; an initial one without a funnel is left out.
 
     Raises:
@@ -86,10 +86,10 @@ def read_contest(folder: Path, console: Console) -> Contest:
     elites, absence = initial_and_best(folder)
     if absence:
         console.message(f"{absence}: the best elite is disturbed alone")
-    return contest_of(elites, elites["best"].record.get("config_hash"))
+    return comparison_of(elites, elites["best"].record.get("config_hash"))
 
 
-def contest_of(elites: dict[str, Elite], config_hash: str | None) -> Contest:
+def comparison_of(elites: dict[str, Elite], config_hash: str | None) -> Comparison:
     """Elites of the same run, by name."""
     robots = [plant_class(elite.plant).from_parameters(elite.parameters) for elite in elites.values()]
     dynamics = [dynamics_of(elite) for elite in elites.values()]
@@ -97,39 +97,39 @@ def contest_of(elites: dict[str, Elite], config_hash: str | None) -> Contest:
     ends = [elite.time[-1] + settling_time(elite, f) for elite, f in zip(elites.values(), dynamics, strict=True)]
     plant, design = jax.tree.map(lambda *leaves: jnp.stack([jnp.asarray(leaf, float) for leaf in leaves]), *robots)
     loops = Loops.of(list(elites.values()), rates)
-    return Contest(tuple(elites), tuple(elites.values()), plant, design, loops, max(ends), config_hash)
+    return Comparison(tuple(elites), tuple(elites.values()), plant, design, loops, max(ends), config_hash)
 
 
-def run(contest: Contest, lanes: Lanes, seed: int, experiment: str, meter: Meter, settles: bool) -> Outcome:
-    """What became of every lane; `settles` lets a batch end as soon as all of its lanes have left or arrived.
+def run(comparison: Comparison, rollouts: Rollouts, seed: int, experiment: str, meter: Meter, settles: bool) -> Outcome:
+    """What became of every rollout; `settles` lets a batch end as soon as all of its rollouts have left or arrived.
 
-    The same lanes and seed give the same outcome.
+    The same rollouts and seed give the same outcome.
     """
-    count = lanes.loop.shape[0]
+    count = rollouts.loop.shape[0]
     parts = []
     for index, begin in enumerate(range(0, count, BATCH)):
         which = np.minimum(begin + np.arange(BATCH), count - 1)
-        batch = jax.tree.map(lambda leaf, which=which: leaf[..., which], lanes)
+        batch = jax.tree.map(lambda leaf, which=which: leaf[..., which], rollouts)
         key = jax.random.fold_in(jax.random.key(seed), index)
-        part = _run_batch(contest, batch, key, settles, lambda share: meter.tick(experiment, BATCH * share))
+        part = _run_batch(comparison, batch, key, settles, lambda share: meter.tick(experiment, BATCH * share))
         real = min(BATCH, count - begin)
         parts.append([np.asarray(leaf)[:real] for leaf in part])
     return Outcome(*(np.concatenate(leaves) for leaves in zip(*parts, strict=True)))
 
 
-def motions(lanes: int) -> int:
+def motions(rollouts: int) -> int:
     """Those that `run` simulates, full batches of them."""
-    return BATCH * math.ceil(lanes / BATCH)
+    return BATCH * math.ceil(rollouts / BATCH)
 
 
-def _run_batch(contest: Contest, batch: Lanes, key, settles: bool, tick) -> Outcome:
-    total, watched = steps_of(contest.horizon), steps_of(WATCHED)
-    quiet = _quiet_from(contest, batch)
-    motion, held = start(contest.loops, batch), jnp.zeros(batch.loop.shape)
+def _run_batch(comparison: Comparison, batch: Rollouts, key, settles: bool, tick) -> Outcome:
+    total, watched = steps_of(comparison.horizon), steps_of(WATCHED)
+    quiet = _quiet_from(comparison, batch)
+    motion, held = start(comparison.loops, batch), jnp.zeros(batch.loop.shape)
     final = held
     for first in range(0, total, CHUNK):
-        motion = advance(contest.loops, batch, motion, jnp.asarray(first), key)
-        final = contest.loops.distance(batch.loop, motion.x)
+        motion = advance(comparison.loops, batch, motion, jnp.asarray(first), key)
+        final = comparison.loops.distance(batch.loop, motion.x)
         if first + CHUNK > total - watched:
             held = jnp.maximum(held, final)
         over = settles and first * STEP > quiet and bool(jnp.all(motion.left | (final <= FORGOTTEN * ARRIVED)))
@@ -140,14 +140,14 @@ def _run_batch(contest: Contest, batch: Lanes, key, settles: bool, tick) -> Outc
     return Outcome(*(np.asarray(leaf) for leaf in (motion.left, final, held)))
 
 
-def _quiet_from(contest: Contest, batch: Lanes) -> float:
+def _quiet_from(comparison: Comparison, batch: Rollouts) -> float:
     """The time from which on nothing but the goal's LQR acts [s]."""
-    last_knot = max(elite.time[-1] for elite in contest.elites)
+    last_knot = max(elite.time[-1] for elite in comparison.elites)
     pushed = jnp.any(batch.heights != 0, axis=1)
     last_push = jnp.max(jnp.where(pushed, batch.centers + 6 * batch.widths, 0.0))
     return max(float(last_push), float(last_knot))
 
 
-def by_loop(contest: Contest, values: np.ndarray) -> Iterator[tuple[str, np.ndarray]]:
+def by_loop(comparison: Comparison, values: np.ndarray) -> Iterator[tuple[str, np.ndarray]]:
     """`values` [C ...] by the loops' names."""
-    return zip(contest.names, values, strict=True)
+    return zip(comparison.names, values, strict=True)

@@ -17,8 +17,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from rtcd_jax.analysis.disturb.comparison import Contest, by_loop
-from rtcd_jax.analysis.disturb.scenarios import LONGEST_DELAY, PULSES, STEP, Lanes, Outcome, undisturbed
+from rtcd_jax.analysis.disturb.comparison import Comparison, by_loop
+from rtcd_jax.analysis.disturb.scenarios import LONGEST_DELAY, PULSES, STEP, Outcome, Rollouts, undisturbed
 from rtcd_jax.elite.closed_loop import ARRIVED
 from rtcd_jax.elite.elite import Elite
 from rtcd_jax.numerics.proportion import clopper_pearson
@@ -37,7 +37,7 @@ LARGEST_PUSH = 0.3
 """Impulse of the largest push over the input limit [s]."""
 
 LEVELS = 21
-"""Of every trouble, from none to the largest (RealAIGym: N_var)."""
+"""Of every perturbation, from none to the largest (RealAIGym: N_var)."""
 REPEATS = 10
 """Motions with noises of their own at each level."""
 MODEL_ERROR = 0.25
@@ -61,23 +61,23 @@ RATES = 1000, 500, 250, 200, 125, 100, 50
 SCORED = "model", "velocity noise", "torque noise", "response", "delay", "perturbation"
 """The criteria whose mean is the score."""
 
-Simulate = Callable[[Lanes, str, bool], Outcome]
-"""Lanes, the experiment's name, whether they may end early -> what became of them."""
+Simulate = Callable[[Rollouts, str, bool], Outcome]
+"""Rollouts, the experiment's name, whether they may end early -> what became of them."""
 
 
-def off_nominal(contest: Contest, states: int, seed: int, simulate: Simulate) -> dict[str, Any]:
+def off_nominal(comparison: Comparison, states: int, seed: int, simulate: Simulate) -> dict[str, Any]:
     """Shares of uniform states of the first ellipsoids, and of enlarged ones, from which each controller arrives.
 
     Both controllers start from the same states, those of either funnel. An ellipsoid itself tests the promise, an
     enlarged one what lies beyond it; of these only states inside the limits are drawn.
     """
     random = np.random.default_rng(seed)
-    places = [(name, factor) for name in contest.names for factor in FACTORS]
-    starts = [_starts(contest.elites[contest.indices[name]], factor, states, random) for name, factor in places]
-    loops = len(contest.names)
+    places = [(name, factor) for name in comparison.names for factor in FACTORS]
+    starts = [_starts(comparison.elites[comparison.indices[name]], factor, states, random) for name, factor in places]
+    loops = len(comparison.names)
     x = np.repeat(np.stack(starts), loops, axis=0).reshape(-1, starts[0].shape[1])
     loop = np.tile(np.repeat(np.arange(loops), states), len(places))
-    outcome = simulate(undisturbed(contest.plant, contest.design, loop, x.T), "off-nominal", True)
+    outcome = simulate(undisturbed(comparison.plant, comparison.design, loop, x.T), "off-nominal", True)
     arrived = _arrived(outcome).reshape(len(places), loops, states)
     return {
         "experiment": "uniform states of the first ellipsoids (sampled rung), and of ellipsoids enlarged by a factor",
@@ -86,7 +86,7 @@ def off_nominal(contest: Contest, states: int, seed: int, simulate: Simulate) ->
         "confidence": CONFIDENCE,
         "factors": FACTORS,
         "summary": {
-            f"{name} ellipsoid x {factor}": dict(_shares(contest, cells))
+            f"{name} ellipsoid x {factor}": dict(_shares(comparison, cells))
             for (name, factor), cells in zip(places, arrived, strict=True)
         },
     }
@@ -101,52 +101,52 @@ def _starts(elite: Elite, factor: float, states: int, random: np.random.Generato
     return found[:states]
 
 
-def _shares(contest: Contest, arrived: np.ndarray) -> Iterator[tuple[str, float]]:
+def _shares(comparison: Comparison, arrived: np.ndarray) -> Iterator[tuple[str, float]]:
     """Each controller's share of successes with both ends of its interval."""
-    for name, row in by_loop(contest, arrived):
+    for name, row in by_loop(comparison, arrived):
         failures, trials = int((~row).sum()), len(row)
         lower, upper = clopper_pearson(failures, trials, (1 + CONFIDENCE) / 2)
         yield from {name: 1 - failures / trials, f"{name} lower": 1 - upper, f"{name} upper": 1 - lower}.items()
 
 
-def impulse(contest: Contest, simulate: Simulate) -> dict[str, Any]:
+def impulse(comparison: Comparison, simulate: Simulate) -> dict[str, Any]:
     """For a bell-shaped push on the first input, over its time and its impulse: recovered or lost, each controller.
 
     Times are from the first whole push to the last knot, the same shares of that for each controller.
     """
     shares = np.linspace(0, 1, TIMES)
-    limit = float(contest.elites[0].u_max[0])
+    limit = float(comparison.elites[0].u_max[0])
     impulses = np.linspace(-1, 1, SIZES) * LARGEST_PUSH * limit
     first = 3 * PUSH_WIDTH
-    times = np.stack([first + shares * (elite.time[-1] - first) for elite in contest.elites])
+    times = np.stack([first + shares * (elite.time[-1] - first) for elite in comparison.elites])
     loop, when, size = (axis.ravel() for axis in np.indices((len(times), TIMES, SIZES)))
-    lanes = _from_start(contest, loop)
-    heights = np.zeros(lanes.heights.shape)
+    rollouts = _from_start(comparison, loop)
+    heights = np.zeros(rollouts.heights.shape)
     heights[0, 0] = impulses[size] / (PUSH_WIDTH * math.sqrt(2 * math.pi))
-    lanes = dataclasses.replace(
-        lanes,
-        centers=lanes.centers.at[0].set(times[loop, when]),
-        widths=lanes.widths.at[0].set(PUSH_WIDTH),
+    rollouts = dataclasses.replace(
+        rollouts,
+        centers=rollouts.centers.at[0].set(times[loop, when]),
+        widths=rollouts.widths.at[0].set(PUSH_WIDTH),
         heights=jnp.asarray(heights),
     )
-    recovered = _arrived(simulate(lanes, "impulse", True)).reshape(len(times), TIMES, SIZES)
+    recovered = _arrived(simulate(rollouts, "impulse", True)).reshape(len(times), TIMES, SIZES)
     return {
         "experiment": f"a push on the first input, a bell with a standard deviation of {PUSH_WIDTH:g} s",
-        "impulse_unit": f"{contest.plant.input_units[0]} s",
-        "times": dict(by_loop(contest, times)),
+        "impulse_unit": f"{comparison.plant.input_units[0]} s",
+        "times": dict(by_loop(comparison, times)),
         "impulses": impulses,
-        "recovered": dict(by_loop(contest, recovered)),
+        "recovered": dict(by_loop(comparison, recovered)),
         "summary": {
-            name: {"recovered": cells.mean(), "largest_at_all_times": _bearable(impulses, cells)}
-            for name, cells in by_loop(contest, recovered)
+            name: {"recovered": cells.mean(), "largest_at_all_times": _largest_tolerated(impulses, cells)}
+            for name, cells in by_loop(comparison, recovered)
         },
     }
 
 
-class Trouble(NamedTuple):
-    """One way in which the robot is not as the model says: `apply(lanes, level [L], random) -> lanes`.
+class Perturbation(NamedTuple):
+    """One way in which the robot is not as the model says: `apply(rollouts, level [L], random) -> rollouts`.
 
-    `levels` in `unit`; every level is simulated `repeats` times. A criterion's success is that of all its troubles.
+    `levels` in `unit`; every level is simulated `repeats` times. A criterion's success is that of all its own.
     """
 
     criterion: str
@@ -154,128 +154,135 @@ class Trouble(NamedTuple):
     unit: str
     levels: np.ndarray
     repeats: int
-    apply: Callable[[Lanes, np.ndarray, np.random.Generator], Lanes]
+    apply: Callable[[Rollouts, np.ndarray, np.random.Generator], Rollouts]
 
 
-def robustness(contest: Contest, seed: int, simulate: Simulate) -> dict[str, Any]:
-    """Success by trouble and level, and the score: the mean over six criteria of the share of successes.
+def robustness(comparison: Comparison, seed: int, simulate: Simulate) -> dict[str, Any]:
+    """Success by perturbation and level, and the score: the mean over six criteria of the share of successes.
 
     The criteria and their ranges follow the RealAIGym benchmark (Wiebe et al., "Open Source Dual-Purpose Acrobot and
     Pendubot Platform", IEEE Robotics & Automation Magazine 31(2), 2024), the robot and what counts as success are ours.
     """
     random = np.random.default_rng(seed)
-    found = troubles(contest)
-    sizes = [len(trouble.levels) * trouble.repeats for trouble in found]
-    loops = len(contest.names)
+    found = perturbations(comparison)
+    sizes = [len(perturbation.levels) * perturbation.repeats for perturbation in found]
+    loops = len(comparison.names)
     parts = []
-    for trouble in found:
-        level = np.repeat(trouble.levels, trouble.repeats)
-        lanes = _from_start(contest, np.repeat(np.arange(loops), len(level)))
-        parts.append(trouble.apply(lanes, np.tile(level, loops), random))
+    for perturbation in found:
+        level = np.repeat(perturbation.levels, perturbation.repeats)
+        rollouts = _from_start(comparison, np.repeat(np.arange(loops), len(level)))
+        parts.append(perturbation.apply(rollouts, np.tile(level, loops), random))
     outcome = simulate(_joined(parts), "robustness", False)
     stayed = np.split(~outcome.left_limits & (outcome.held <= 1), loops * np.cumsum(sizes)[:-1])
-    successes = [part.reshape(loops, len(trouble.levels), -1) for part, trouble in zip(stayed, found, strict=True)]
+    successes = [part.reshape(loops, len(each.levels), -1) for part, each in zip(stayed, found, strict=True)]
     return {
         "experiment": "the swing-up from its start on a robot that is not as the model says",
         "seed": seed,
         "troubles": [
             {
-                "criterion": trouble.criterion,
-                "name": trouble.name,
-                "unit": trouble.unit,
-                "levels": trouble.levels,
-                "success": {name: part.mean(axis=1) for name, part in by_loop(contest, success)},
+                "criterion": perturbation.criterion,
+                "name": perturbation.name,
+                "unit": perturbation.unit,
+                "levels": perturbation.levels,
+                "success": {name: part.mean(axis=1) for name, part in by_loop(comparison, success)},
             }
-            for trouble, success in zip(found, successes, strict=True)
+            for perturbation, success in zip(found, successes, strict=True)
         ],
-        "summary": dict(by_loop(contest, _scores(found, successes, loops))),
+        "summary": dict(by_loop(comparison, _scores(found, successes, loops))),
     }
 
 
-def _scores(found: list[Trouble], successes: list[np.ndarray], loops: int) -> np.ndarray:
-    """For each loop, every criterion's mean over its troubles, and the score."""
+def _scores(found: list[Perturbation], successes: list[np.ndarray], loops: int) -> np.ndarray:
+    """For each loop, every criterion's mean over its perturbations, and the score."""
     scores: list[dict[str, float]] = []
     for loop in range(loops):
         criteria: dict[str, list[float]] = {}
-        for trouble, success in zip(found, successes, strict=True):
-            criteria.setdefault(trouble.criterion, []).append(float(success[loop].mean()))
+        for perturbation, success in zip(found, successes, strict=True):
+            criteria.setdefault(perturbation.criterion, []).append(float(success[loop].mean()))
         means = {criterion: float(np.mean(shares)) for criterion, shares in criteria.items()}
         scores.append({"score": float(np.mean([means[criterion] for criterion in SCORED])), **means})
     return np.array(scores, dtype=object)
 
 
-def troubles(contest: Contest) -> list[Trouble]:
-    """All of them, for the robot of a contest."""
-    elite = contest.elites[0]
+def perturbations(comparison: Comparison) -> list[Perturbation]:
+    """All of them, for the robot of a comparison."""
+    elite = comparison.elites[0]
     half = elite.x_goal.size // 2
     limits = elite.u_max
-    speeds = np.max([np.abs(elite.x[:, half:]).max(axis=0) for elite in contest.elites], axis=0)
+    speeds = np.max([np.abs(elite.x[:, half:]).max(axis=0) for elite in comparison.elites], axis=0)
     relative = np.linspace(-MODEL_ERROR, MODEL_ERROR, LEVELS)
 
     def none_to(largest: float) -> np.ndarray:
         return np.linspace(0, largest, LEVELS)
 
     return [
-        *(Trouble("model", name, "relative", relative, 1, change) for name, change in _parameters(contest).items()),
-        Trouble("velocity noise", "velocity noise", "largest nominal speed", none_to(VELOCITY_NOISE), REPEATS,
-                lambda lanes, level, _: dataclasses.replace(lanes, velocity_noise=speeds[:, None] * level)),
-        Trouble("torque noise", "torque noise", "input limit", none_to(INPUT_NOISE), REPEATS,
-                lambda lanes, level, _: dataclasses.replace(lanes, input_noise=limits[:, None] * level)),
-        Trouble("response", "response time", "s", none_to(LAG), 1,
-                lambda lanes, level, _: dataclasses.replace(lanes, lag=jnp.asarray(level))),
-        Trouble("delay", "delay", "s", none_to(DELAY), 1,
-                lambda lanes, level, _: dataclasses.replace(lanes, delay=jnp.asarray(np.round(level / STEP), int))),
-        Trouble("perturbation", "perturbation", "profile", np.arange(PROFILES, dtype=float), 1,
-                lambda lanes, level, random: _perturbed(contest, lanes, random)),
-        Trouble("control rate", "control rate", "Hz", np.array(RATES, float), 1,
-                lambda lanes, rate, _: dataclasses.replace(lanes, period=jnp.asarray(np.round(1 / rate / STEP), int))),
+        *(Perturbation("model", name, "relative", relative, 1, change)
+          for name, change in _parameters(comparison).items()),
+        Perturbation("velocity noise", "velocity noise", "largest nominal speed", none_to(VELOCITY_NOISE), REPEATS,
+                lambda rollouts, level, _: dataclasses.replace(rollouts, velocity_noise=speeds[:, None] * level)),
+        Perturbation("torque noise", "torque noise", "input limit", none_to(INPUT_NOISE), REPEATS,
+                lambda rollouts, level, _: dataclasses.replace(rollouts, input_noise=limits[:, None] * level)),
+        Perturbation("response", "response time", "s", none_to(LAG), 1,
+                lambda rollouts, level, _: dataclasses.replace(rollouts, lag=jnp.asarray(level))),
+        Perturbation("delay", "delay", "s", none_to(DELAY), 1,
+                lambda rollouts, level, _: dataclasses.replace(rollouts, delay=_steps(level))),
+        Perturbation("perturbation", "perturbation", "profile", np.arange(PROFILES, dtype=float), 1,
+                lambda rollouts, level, random: _perturbed(comparison, rollouts, random)),
+        Perturbation("control rate", "control rate", "Hz", np.array(RATES, float), 1,
+                lambda rollouts, rate, _: dataclasses.replace(rollouts, period=_steps(1 / rate))),
     ]  # fmt: skip
 
 
-def _parameters(contest: Contest) -> Mapping[str, Callable[[Lanes, np.ndarray, Any], Lanes]]:
+def _parameters(comparison: Comparison) -> Mapping[str, Callable[[Rollouts, np.ndarray, Any], Rollouts]]:
     """What scales each uncertain number of the robot by 1 + level: its design, its constants, its input limit.
 
     Gravity is known.
     """
 
-    def scaling(where: Callable[[Lanes], Any]) -> Callable[[Lanes, np.ndarray, Any], Lanes]:
-        return lambda lanes, level, _: eqx.tree_at(where, lanes, where(lanes) * (1 + level))
+    def scaling(where: Callable[[Rollouts], Any]) -> Callable[[Rollouts, np.ndarray, Any], Rollouts]:
+        return lambda rollouts, level, _: eqx.tree_at(where, rollouts, where(rollouts) * (1 + level))
 
     constants = [
         field.name
-        for field in dataclasses.fields(contest.plant)
+        for field in dataclasses.fields(comparison.plant)
         if not field.metadata.get("static") and field.name != "gravity" and not field.name.endswith("_limit")
     ]
+    design = comparison.plant.design_units
     return {
-        **{name: scaling(lambda lanes, name=name: getattr(lanes.design, name)) for name in contest.plant.design_units},
-        **{name: scaling(lambda lanes, name=name: getattr(lanes.plant, name)) for name in constants},
-        "input limit": scaling(lambda lanes: lanes.strength),
+        **{name: scaling(lambda rollouts, name=name: getattr(rollouts.design, name)) for name in design},
+        **{name: scaling(lambda rollouts, name=name: getattr(rollouts.plant, name)) for name in constants},
+        "input limit": scaling(lambda rollouts: rollouts.actuator_scale),
     }
 
 
-def _perturbed(contest: Contest, lanes: Lanes, random: np.random.Generator) -> Lanes:
+def _steps(seconds: np.ndarray) -> jax.Array:
+    """The nearest whole steps."""
+    return jnp.asarray(np.round(seconds / STEP), int)
+
+
+def _perturbed(comparison: Comparison, rollouts: Rollouts, random: np.random.Generator) -> Rollouts:
     """Random pulses, one in each part of the motion, the same for all loops but for the motions' lengths."""
-    inputs = contest.elites[0].u_max
+    inputs = comparison.elites[0].u_max
     shares = (np.arange(PULSES)[:, None] + random.uniform(size=(PULSES, PROFILES))) / PULSES
     widths = random.uniform(*PULSE_WIDTHS, size=(PULSES, PROFILES))
     sizes = random.uniform(*PULSE_HEIGHTS, size=(PULSES, len(inputs), PROFILES))
     heights = inputs[:, None] * sizes * random.choice([-1, 1], size=sizes.shape)
-    durations = np.array([elite.time[-1] for elite in contest.elites])
+    durations = np.array([elite.time[-1] for elite in comparison.elites])
     return dataclasses.replace(
-        lanes,
+        rollouts,
         centers=jnp.asarray(np.concatenate([shares * duration for duration in durations], axis=1)),
         widths=jnp.asarray(np.tile(widths, len(durations))),
         heights=jnp.asarray(np.tile(heights, len(durations))),
     )
 
 
-def _from_start(contest: Contest, loop: np.ndarray) -> Lanes:
-    """Undisturbed lanes from the nominal motions' first states."""
-    first = np.stack([elite.x[0] for elite in contest.elites])
-    return undisturbed(contest.plant, contest.design, loop, first[loop].T)
+def _from_start(comparison: Comparison, loop: np.ndarray) -> Rollouts:
+    """Undisturbed rollouts from the nominal motions' first states."""
+    first = np.stack([elite.x[0] for elite in comparison.elites])
+    return undisturbed(comparison.plant, comparison.design, loop, first[loop].T)
 
 
-def _joined(parts: list[Lanes]) -> Lanes:
+def _joined(parts: list[Rollouts]) -> Rollouts:
     return jax.tree.map(lambda *leaves: jnp.concatenate(leaves, axis=-1), *parts)
 
 
@@ -283,8 +290,8 @@ def _arrived(outcome: Outcome) -> np.ndarray:
     return ~outcome.left_limits & (outcome.final <= ARRIVED)
 
 
-def _bearable(impulses: np.ndarray, recovered: np.ndarray) -> float:
+def _largest_tolerated(impulses: np.ndarray, recovered: np.ndarray) -> float:
     """The largest |impulse| up to which all pushes, to both sides and at all times, were recovered from."""
     lost = np.abs(impulses)[~recovered.all(axis=0)]
-    borne = np.abs(impulses)[np.abs(impulses) < lost.min()] if lost.size else np.abs(impulses)
-    return float(borne.max(initial=0.0))
+    tolerated = np.abs(impulses)[np.abs(impulses) < lost.min()] if lost.size else np.abs(impulses)
+    return float(tolerated.max(initial=0.0))

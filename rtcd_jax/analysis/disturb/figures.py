@@ -87,20 +87,20 @@ def _impulse(figure: "Figure", record: Mapping[str, Any]) -> None:
 
 
 def _robustness(figure: "Figure", record: Mapping[str, Any]) -> None:
-    troubles = record["troubles"]
-    panels = figure.subplots(len(troubles), 1, squeeze=False)[:, 0]
-    for axes, trouble in zip(panels, troubles, strict=True):
-        _strip(axes, trouble)
+    perturbations = record["troubles"]
+    panels = figure.subplots(len(perturbations), 1, squeeze=False)[:, 0]
+    for axes, perturbation in zip(panels, perturbations, strict=True):
+        _strip(axes, perturbation)
     scores = ", ".join(f"{name} {criteria['score']:.0%}" for name, criteria in record["summary"].items())
     figure.suptitle(f"share of successes at each level (dark: all); score {scores}", fontsize=9)
 
 
-def _strip(axes: "Axes", trouble: Mapping[str, Any]) -> None:
-    """A row of cells for each controller over the levels of one trouble."""
+def _strip(axes: "Axes", perturbation: Mapping[str, Any]) -> None:
+    """A row of cells for each controller over the levels of one perturbation."""
     from matplotlib.colors import LinearSegmentedColormap
 
     shades = LinearSegmentedColormap.from_list("success", [LIGHT, COLORS["initial"]])
-    levels, success = trouble["levels"], trouble["success"]
+    levels, success = perturbation["levels"], perturbation["success"]
     cells = np.array(list(success.values()), float)
     axes.pcolormesh(np.arange(len(levels) + 1), np.arange(len(cells) + 1), cells, cmap=shades, vmin=0, vmax=1)
     axes.pcolormesh(
@@ -109,14 +109,15 @@ def _strip(axes: "Axes", trouble: Mapping[str, Any]) -> None:
     axes.invert_yaxis()
     axes.set_yticks(np.arange(len(cells)) + 0.5, list(success), fontsize=SMALL - 1)
     shown = np.arange(0, len(levels), max(1, (len(levels) - 1) // _TICKS))
-    axes.set_xticks(shown + 0.5, _ticks(trouble, [levels[i] for i in shown]), fontsize=SMALL - 1)
+    axes.set_xticks(shown + 0.5, _ticks(perturbation, [levels[i] for i in shown]), fontsize=SMALL - 1)
     axes.tick_params(length=0)
-    axes.set_title(f"{words(trouble['name'])} [{trouble['unit']}]", loc="left", fontsize=SMALL, color=GRAY, pad=2)
+    title = f"{words(perturbation['name'])} [{perturbation['unit']}]"
+    axes.set_title(title, loc="left", fontsize=SMALL, color=GRAY, pad=2)
     for spine in axes.spines.values():
         spine.set_visible(False)
 
 
-def _ticks(trouble: Mapping[str, Any], levels: Sequence[float]) -> list[str]:
-    if trouble["unit"] == "relative":
+def _ticks(perturbation: Mapping[str, Any], levels: Sequence[float]) -> list[str]:
+    if perturbation["unit"] == "relative":
         return [f"{level:+.0%}" if round(level, 6) else "0%" for level in levels]
     return [f"{level:g}" for level in np.round(levels, 6).tolist()]

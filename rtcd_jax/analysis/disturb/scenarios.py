@@ -1,7 +1,7 @@
-"""Many disturbed motions of a run's closed loops at once: every lane has a robot, a controller and troubles of its own.
+"""Many perturbed rollouts of a run's closed loops at once: each has a robot, a controller and perturbations of its own.
 
-The robot is the plant's closed form with the lane's true parameters, by Runge-Kutta steps of `STEP`, its input held in
-each. The controller knows nothing of what is wrong: at its own rate it evaluates the loop's law, from the state of a
+The robot is the plant's closed form with the rollout's true parameters, by Runge-Kutta steps of `STEP`, its input held
+in each. The controller knows nothing of what is wrong: at its own rate it evaluates the loop's law, from the state of a
 while ago and with noise on the velocities; what it asks for lags, is noisy, and ends at the robot's true limits.
 """
 
@@ -25,7 +25,7 @@ STEP = 1e-3
 LONGEST_DELAY = 0.1
 """Of the measurements [s]."""
 PULSES = 3
-"""Bell-shaped pushes that a lane can take."""
+"""Bell-shaped pushes that a rollout can take."""
 CHUNK = 250
 """Steps between two looks from outside."""
 WATCHED = 1.0
@@ -92,11 +92,11 @@ class Loops(eqx.Module):
 
 
 @final
-class Lanes(eqx.Module):
-    """L motions and what troubles them; leaves [L], with the states' or inputs' axis before it.
+class Rollouts(eqx.Module):
+    """L motions and what perturbations them; leaves [L], with the states' or inputs' axis before it.
 
     `loop` is the controller's index and `x` the state at t = 0. Of the robot: `plant` and `design` with its true
-    numbers, and `strength`, its true input limit over the nominal one. Of the controller: the control period and the
+    numbers, and `actuator_scale`, its true input limit over the nominal one. Of the controller: control period and
     delay [steps], noise on the velocities (standard deviation [n/2]). Of the motor: `lag`, the time constant [s], noise
     (standard deviation [m]). Pulses on the inputs: center [s], width (standard deviation [s]) and height.
     """
@@ -105,7 +105,7 @@ class Lanes(eqx.Module):
     x: Float[Array, "n L"]
     plant: Plant
     design: Any
-    strength: Float[Array, " L"]
+    actuator_scale: Float[Array, " L"]
     period: Int[Array, " L"]
     delay: Int[Array, " L"]
     velocity_noise: Float[Array, "n/2 L"]
@@ -118,7 +118,7 @@ class Lanes(eqx.Module):
 
 @final
 class Motion(eqx.Module):
-    """Where the lanes are: state, what the motors give and are asked for, their noise, past states, who left."""
+    """Where the rollouts are: state, what the motors give and are asked for, their noise, past states, who left."""
 
     x: Float[Array, "n L"]
     input: Float[Array, "m L"]
@@ -129,27 +129,27 @@ class Motion(eqx.Module):
 
 
 class Outcome(NamedTuple):
-    """Of every lane: whether it left the limits; V/rho at the goal in the end, and its largest in the last second."""
+    """Of every rollout: whether it left the limits; V/rho at the goal in the end, the largest in the last second."""
 
     left_limits: np.ndarray
     final: np.ndarray
     held: np.ndarray
 
 
-def undisturbed(plant: Plant, design: Any, loop: np.ndarray, x: np.ndarray) -> Lanes:
-    """Lanes from states [n L] without any trouble; leaves of `plant` and `design` [C] are those of the loops."""
+def undisturbed(plant: Plant, design: Any, loop: np.ndarray, x: np.ndarray) -> Rollouts:
+    """Rollouts from states [n L] without perturbations; leaves of `plant` and `design` [C] are those of the loops."""
     count, n, m = len(loop), plant.n, plant.m
 
     def zeros(*shape: int) -> jax.Array:
         return jnp.zeros((*shape, count))
 
     own = jax.tree.map(lambda leaf: jnp.asarray(leaf)[loop], (plant, design))
-    return Lanes(
+    return Rollouts(
         loop=jnp.asarray(loop),
         x=jnp.asarray(x),
         plant=own[0],
         design=own[1],
-        strength=jnp.ones(count),
+        actuator_scale=jnp.ones(count),
         period=jnp.ones(count, int),
         delay=jnp.zeros(count, int),
         velocity_noise=zeros(n // 2),
@@ -161,57 +161,57 @@ def undisturbed(plant: Plant, design: Any, loop: np.ndarray, x: np.ndarray) -> L
     )
 
 
-def start(loops: Loops, lanes: Lanes) -> Motion:
-    """All lanes at t = 0, where the delayed measurements say that they have always been."""
+def start(loops: Loops, rollouts: Rollouts) -> Motion:
+    """All rollouts at t = 0, where the delayed measurements say that they have always been."""
     delays = round(LONGEST_DELAY / STEP) + 1
-    nothing = jnp.zeros_like(lanes.input_noise)
-    past = jnp.broadcast_to(lanes.x, (delays, *lanes.x.shape))
-    return Motion(lanes.x, nothing, nothing, nothing, past, ~loops.inside(lanes.x))
+    nothing = jnp.zeros_like(rollouts.input_noise)
+    past = jnp.broadcast_to(rollouts.x, (delays, *rollouts.x.shape))
+    return Motion(rollouts.x, nothing, nothing, nothing, past, ~loops.inside(rollouts.x))
 
 
 @jax.jit
-def advance(loops: Loops, lanes: Lanes, motion: Motion, first: Int[Array, ""], key: jax.Array) -> Motion:
-    """The lanes after `CHUNK` more steps, from step `first` on; a lane that left the limits stays where it did."""
-    noisy = jnp.any(lanes.velocity_noise > 0) | jnp.any(lanes.input_noise > 0)
-    follow = jnp.where(lanes.lag > 0, -jnp.expm1(-STEP / jnp.maximum(lanes.lag, STEP * 1e-3)), 1.0)
+def advance(loops: Loops, rollouts: Rollouts, motion: Motion, first: Int[Array, ""], key: jax.Array) -> Motion:
+    """The rollouts after `CHUNK` more steps, from step `first` on; one that left the limits stays where it did."""
+    noisy = jnp.any(rollouts.velocity_noise > 0) | jnp.any(rollouts.input_noise > 0)
+    follow = jnp.where(rollouts.lag > 0, -jnp.expm1(-STEP / jnp.maximum(rollouts.lag, STEP * 1e-3)), 1.0)
 
     def step(motion: Motion, index):
         t = index * STEP
         past = motion.past.at[index % len(motion.past)].set(motion.x)
-        command, noise = _decide(loops, lanes, motion, past, index, key, noisy)
+        command, noise = _decide(loops, rollouts, motion, past, index, key, noisy)
         given = motion.input + follow * (command - motion.input)
-        bound = lanes.strength * loops.input_limits[:, None]
-        pushed = jnp.clip(given + noise, -bound, bound) + _pushes(lanes, t + STEP / 2)
-        x = rk4_step(partial(_slope, lanes), split(motion.x), pushed, STEP)
+        bound = rollouts.actuator_scale * loops.input_limits[:, None]
+        pushed = jnp.clip(given + noise, -bound, bound) + _pushes(rollouts, t + STEP / 2)
+        x = rk4_step(partial(_slope, rollouts), split(motion.x), pushed, STEP)
         moved = jnp.where(motion.left, motion.x, jnp.stack(x))
         return Motion(moved, given, command, noise, past, motion.left | ~loops.inside(moved)), None
 
     return jax.lax.scan(step, motion, first + jnp.arange(CHUNK))[0]
 
 
-def _decide(loops: Loops, lanes: Lanes, motion: Motion, past, index, key, noisy):
+def _decide(loops: Loops, rollouts: Rollouts, motion: Motion, past, index, key, noisy):
     """What the controllers ask for after step `index`, and the motors' noise: new where a control period begins."""
-    count = len(lanes.loop)
-    seen = past[(index - lanes.delay) % len(past), :, jnp.arange(count)].T
+    count = len(rollouts.loop)
+    seen = past[(index - rollouts.delay) % len(past), :, jnp.arange(count)].T
     m, half = loops.input_limits.size, loops.goal.size // 2
 
     def draw():
         return jax.random.normal(jax.random.fold_in(key, index), (half + m, count))
 
     random = jax.lax.cond(noisy, draw, lambda: jnp.zeros((half + m, count)))
-    seen = seen.at[half:].add(lanes.velocity_noise * random[:half])
-    due = index % lanes.period == 0
-    asked = jnp.stack(loops.law(lanes.loop, index * STEP, split(seen)))
-    return jnp.where(due, asked, motion.command), jnp.where(due, lanes.input_noise * random[half:], motion.noise)
+    seen = seen.at[half:].add(rollouts.velocity_noise * random[:half])
+    due = index % rollouts.period == 0
+    asked = jnp.stack(loops.law(rollouts.loop, index * STEP, split(seen)))
+    return jnp.where(due, asked, motion.command), jnp.where(due, rollouts.input_noise * random[half:], motion.noise)
 
 
-def _pushes(lanes: Lanes, t) -> Float[Array, "m L"]:
-    bells = jnp.exp(-0.5 * ((t - lanes.centers) / lanes.widths) ** 2)
-    return jnp.sum(lanes.heights * bells[:, None], axis=0)
+def _pushes(rollouts: Rollouts, t) -> Float[Array, "m L"]:
+    bells = jnp.exp(-0.5 * ((t - rollouts.centers) / rollouts.widths) ** 2)
+    return jnp.sum(rollouts.heights * bells[:, None], axis=0)
 
 
-def _slope(lanes: Lanes, x: tuple, u):
-    return split(lanes.plant.dynamics(lanes.design, jnp.stack(x), u))
+def _slope(rollouts: Rollouts, x: tuple, u):
+    return split(rollouts.plant.dynamics(rollouts.design, jnp.stack(x), u))
 
 
 def _rows(elite: Elite, rates: np.ndarray) -> np.ndarray:

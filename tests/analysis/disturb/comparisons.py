@@ -2,7 +2,7 @@
 
 import dataclasses
 
-from rtcd_jax.analysis.disturb.comparison import contest_of
+from rtcd_jax.analysis.disturb.comparison import comparison_of
 from rtcd_jax.elite.elite import Elite
 from tests.export.folders import run_folder
 
@@ -12,7 +12,7 @@ def elite_of(path, plant):
     return Elite.read(run_folder(path, plant), "000")
 
 
-def contest(path, plant):
+def comparison(path, plant):
     """An elite as the initial one, and as the best one the same with gains that are a tenth larger."""
     elite = elite_of(path, plant)
-    return contest_of({"initial": elite, "best": dataclasses.replace(elite, K=1.1 * elite.K)}, "0123456789ab")
+    return comparison_of({"initial": elite, "best": dataclasses.replace(elite, K=1.1 * elite.K)}, "0123456789ab")

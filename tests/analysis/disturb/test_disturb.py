@@ -9,7 +9,7 @@ import pytest
 from rtcd_jax.analysis import disturb
 from rtcd_jax.analysis.disturb import comparison as contests
 from rtcd_jax.analysis.disturb import disturb_run, experiments
-from rtcd_jax.analysis.disturb.comparison import Meter, motions, read_contest, run
+from rtcd_jax.analysis.disturb.comparison import Meter, motions, read_comparison, run
 from rtcd_jax.analysis.disturb.experiments import SCORED
 from rtcd_jax.analysis.disturb.scenarios import undisturbed
 from rtcd_jax.elite.closed_loop import runge_kutta, simulate
@@ -93,12 +93,12 @@ def test_the_same_seed_gives_the_same_records_and_another_one_others(disturbed, 
 def test_verdicts_are_the_verifications(tmp_path):
     """Uniform states of the first ellipsoid, and others twelve times as far: arrived or not, state by state."""
     folder = run_folder(tmp_path / "run", "pendulum")
-    contest = read_contest(folder, Screen().console)
-    elite = contest.elites[1]
+    comparison = read_comparison(folder, Screen().console)
+    elite = comparison.elites[1]
     x = elite.points(np.zeros(60, int), np.random.default_rng(0))
     x[::2] = elite.x[0] + 3 * (x[::2] - elite.x[0])
-    lanes = undisturbed(contest.plant, contest.design, np.ones(60, int), x.T)
-    found = run(contest, lanes, 0, "", NoMeter(), settles=True)
+    rollouts = undisturbed(comparison.plant, comparison.design, np.ones(60, int), x.T)
+    found = run(comparison, rollouts, 0, "", NoMeter(), settles=True)
     simulator = next(simulators_of(elite, 60))
     seen = simulate(elite, simulator.dynamics, runge_kutta(simulator.dynamics, 2e-3), np.zeros(60, int), x)
     lost = found.left_limits | ~(found.final <= 1e-3)
@@ -109,8 +109,8 @@ def test_verdicts_are_the_verifications(tmp_path):
 def test_a_batch_that_may_end_early_gives_the_verdicts_of_one_that_may_not(pendulums):
     elite = pendulums.elites[0]
     x = elite.points(np.zeros(40, int), np.random.default_rng(2))
-    lanes = undisturbed(pendulums.plant, pendulums.design, np.zeros(40, int), x.T)
-    early, late = (run(pendulums, lanes, 0, "", NoMeter(), settles) for settles in (True, False))
+    rollouts = undisturbed(pendulums.plant, pendulums.design, np.zeros(40, int), x.T)
+    early, late = (run(pendulums, rollouts, 0, "", NoMeter(), settles) for settles in (True, False))
     np.testing.assert_array_equal(early.left_limits, late.left_limits)
     np.testing.assert_array_equal(early.final <= 1e-3, late.final <= 1e-3)
     assert np.all(late.final[~late.left_limits] <= late.held[~late.left_limits])
@@ -119,8 +119,8 @@ def test_a_batch_that_may_end_early_gives_the_verdicts_of_one_that_may_not(pendu
 def test_batches_are_full_and_outcomes_are_as_many_as_lanes(pendulums):
     assert [motions(count) for count in (1, 256, 257)] == [256, 256, 512]
     x = np.tile(pendulums.elites[0].x[0], (259, 1))
-    lanes = undisturbed(pendulums.plant, pendulums.design, np.zeros(259, int), x.T)
-    outcome = run(pendulums, lanes, 0, "", NoMeter(), settles=True)
+    rollouts = undisturbed(pendulums.plant, pendulums.design, np.zeros(259, int), x.T)
+    outcome = run(pendulums, rollouts, 0, "", NoMeter(), settles=True)
     assert outcome.final.shape == (259,)
     np.testing.assert_array_equal(outcome.final, outcome.final[0])
 
@@ -130,7 +130,7 @@ def test_an_initial_candidate_without_a_funnel_is_left_out(tmp_path):
     arrays, record = read_elite(folder, "initial")
     write_elite(folder, "initial", arrays, record | {"status": "FUNNEL_EMPTY"})
     screen = Screen()
-    assert read_contest(folder, screen.console).names == ("best",)
+    assert read_comparison(folder, screen.console).names == ("best",)
     assert screen.text == "the initial candidate has no funnel (FUNNEL_EMPTY): the best elite is disturbed alone\n"
 
 

@@ -1,4 +1,4 @@
-"""The lanes are the loop that is verified, and their troubles are what they are said to be."""
+"""The rollouts are the loop that is verified, and their perturbations are what they are said to be."""
 
 import dataclasses
 
@@ -13,32 +13,32 @@ from rtcd_jax.elite.closed_loop import ClosedLoop, runge_kutta
 from rtcd_jax.elite.simulators import CLOSED_FORMS
 
 COUNT = 512
-"""Lanes of every test, so that they share a program."""
+"""Rollouts of every test, so that they share a program."""
 KEY = jax.random.key(0)
 
 
-def lanes_of(contest, loop, x):
+def rollouts_of(comparison, loop, x):
     """Undisturbed ones, in the number that the compiled program takes."""
     which = np.arange(COUNT) % len(x)
-    return undisturbed(contest.plant, contest.design, np.asarray(loop)[which], np.asarray(x, float)[which].T)
+    return undisturbed(comparison.plant, comparison.design, np.asarray(loop)[which], np.asarray(x, float)[which].T)
 
 
-def moved(contest, lanes, chunks=1, key=KEY):
+def moved(comparison, rollouts, chunks=1, key=KEY):
     """The motion after so many chunks."""
-    motion = start(contest.loops, lanes)
+    motion = start(comparison.loops, rollouts)
     for chunk in range(chunks):
-        motion = advance(contest.loops, lanes, motion, jnp.asarray(chunk * CHUNK), key)
+        motion = advance(comparison.loops, rollouts, motion, jnp.asarray(chunk * CHUNK), key)
     return motion
 
 
-def with_law(contest, **changes):
-    """The contest with another table, from its elites with some arrays replaced by functions of them."""
+def with_law(comparison, **changes):
+    """The comparison with another table, from its elites with some arrays replaced by functions of them."""
     elites = [
         dataclasses.replace(elite, **{name: change(getattr(elite, name)) for name, change in changes.items()})
-        for elite in contest.elites
+        for elite in comparison.elites
     ]
     return dataclasses.replace(
-        contest, loops=Loops.of(elites, [np.zeros((len(e.u), 2, e.x_goal.size)) for e in elites])
+        comparison, loops=Loops.of(elites, [np.zeros((len(e.u), 2, e.x_goal.size)) for e in elites])
     )
 
 
@@ -62,7 +62,7 @@ def test_undisturbed_motions_are_the_verifications_up_to_the_hold(robots):
     loop = ClosedLoop.of(elite, f)
     offsets = 0.02 * np.random.default_rng(1).normal(size=(8, robots.plant.n))
     offsets[0] = 0
-    motion = moved(robots, lanes_of(robots, np.zeros(8, int), elite.x[0] + offsets))
+    motion = moved(robots, rollouts_of(robots, np.zeros(8, int), elite.x[0] + offsets))
     x, seconds, march = elite.x[0] + offsets, CHUNK * STEP, runge_kutta(f, STEP)
     for k in range(len(elite.u)):
         *_, x = march(loop.tracking(k), elite.time[k], elite.time[k + 1], x)
@@ -72,9 +72,9 @@ def test_undisturbed_motions_are_the_verifications_up_to_the_hold(robots):
     assert not motion.left.any()
 
 
-def _oracle(contest, index, x, seconds, *, strength, period, delay, lag, center, width, height, scale):
-    """One lane with all troubles but noise, step by step in numpy; `scale` is that of the first design variable."""
-    elite = contest.elites[index]
+def _oracle(comparison, index, x, seconds, *, actuator_scale, period, delay, lag, center, width, height, scale):
+    """One rollout, all perturbations but noise, step by step in numpy; `scale` is the first design variable's."""
+    elite = comparison.elites[index]
     first = {"pendulum": "m", "cartpole": "lp"}[elite.plant]
     parameters = elite.parameters | {first: elite.parameters[first] * scale}
     if elite.plant == "cartpole":
@@ -90,7 +90,7 @@ def _oracle(contest, index, x, seconds, *, strength, period, delay, lag, center,
             policy = known.tracking(k) if k < len(elite.u) else known.holding()
             command = policy(t, seen[None])[0, 0]
         given += (1 - np.exp(-STEP / lag)) * (command - given)
-        bound = strength * elite.u_max[0]
+        bound = actuator_scale * elite.u_max[0]
         bell = height * np.exp(-0.5 * ((t + STEP / 2 - center) / width) ** 2)
         pushed = np.clip(given, -bound, bound) + bell
         *_, now = runge_kutta(f, STEP)(lambda t, x, u=pushed: np.full((1, 1), u), 0.0, STEP, past[-1][None])
@@ -100,49 +100,51 @@ def _oracle(contest, index, x, seconds, *, strength, period, delay, lag, center,
 
 @pytest.mark.parametrize("index", [0, 1])
 def test_all_troubles_at_once_are_those_of_a_simulation_written_apart(robots, index):
-    told = {"strength": 0.7, "period": 7, "delay": 23, "lag": 0.02, "center": 0.1, "width": 0.015, "scale": 1.1}
+    told = {"actuator_scale": 0.7, "period": 7, "delay": 23, "lag": 0.02, "center": 0.1, "width": 0.015, "scale": 1.1}
     height = 0.8 * robots.elites[0].u_max[0]
     x = robots.elites[0].x[0] + 0.02
-    lanes = lanes_of(robots, [index], [x])
+    rollouts = rollouts_of(robots, [index], [x])
     first = next(iter(robots.plant.design_units))
-    lanes = dataclasses.replace(
-        lanes,
-        strength=jnp.full(COUNT, told["strength"]),
+    rollouts = dataclasses.replace(
+        rollouts,
+        actuator_scale=jnp.full(COUNT, told["actuator_scale"]),
         period=jnp.full(COUNT, told["period"]),
         delay=jnp.full(COUNT, told["delay"]),
         lag=jnp.full(COUNT, told["lag"]),
-        centers=lanes.centers.at[1].set(told["center"]),
-        widths=lanes.widths.at[1].set(told["width"]),
-        heights=lanes.heights.at[1].set(height),
-        design=eqx.tree_at(lambda d: getattr(d, first), lanes.design, getattr(lanes.design, first) * told["scale"]),
+        centers=rollouts.centers.at[1].set(told["center"]),
+        widths=rollouts.widths.at[1].set(told["width"]),
+        heights=rollouts.heights.at[1].set(height),
+        design=eqx.tree_at(
+            lambda d: getattr(d, first), rollouts.design, getattr(rollouts.design, first) * told["scale"]
+        ),
     )
     expected = _oracle(robots, index, x, CHUNK * STEP, height=height, **told)
-    np.testing.assert_allclose(moved(robots, lanes).x[:, 0], expected, rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(moved(robots, rollouts).x[:, 0], expected, rtol=1e-9, atol=1e-9)
 
 
 def test_a_push_changes_the_momentum_by_its_impulse(pendulums):
     """From rest, hanging, without feedback: m l^2 theta_dot = J, less what gravity and damping take in 40 ms."""
     free = with_law(pendulums, K=np.zeros_like, K_goal=np.zeros_like, u=np.zeros_like)
-    lanes = lanes_of(free, [0], [[0.0, 0.0]])
+    rollouts = rollouts_of(free, [0], [[0.0, 0.0]])
     impulse, width = 1e-3, 0.004
     height = impulse / (width * np.sqrt(2 * np.pi))
-    lanes = dataclasses.replace(
-        lanes,
-        centers=lanes.centers.at[0].set(0.23),
-        widths=lanes.widths.at[0].set(width),
-        heights=lanes.heights.at[0].set(height),
+    rollouts = dataclasses.replace(
+        rollouts,
+        centers=rollouts.centers.at[0].set(0.23),
+        widths=rollouts.widths.at[0].set(width),
+        heights=rollouts.heights.at[0].set(height),
     )
     p = pendulums.elites[0].parameters
-    speed = moved(free, lanes).x[1, 0]
+    speed = moved(free, rollouts).x[1, 0]
     np.testing.assert_allclose(speed * p["m"] * p["l"] ** 2, impulse, rtol=0.03)
 
 
 def test_noise_on_the_input_walks_as_it_should(pendulums):
     """Of its own standard deviation, and held for a period: a constant torque, which moves in proportion."""
     free = with_law(pendulums, K=np.zeros_like, K_goal=np.zeros_like, u=np.zeros_like)
-    lanes = lanes_of(free, [0], [[0.0, 0.0]])
-    lanes = dataclasses.replace(lanes, input_noise=jnp.full((1, COUNT), 0.1), period=jnp.full(COUNT, CHUNK))
-    motion = moved(free, lanes)
+    rollouts = rollouts_of(free, [0], [[0.0, 0.0]])
+    rollouts = dataclasses.replace(rollouts, input_noise=jnp.full((1, COUNT), 0.1), period=jnp.full(COUNT, CHUNK))
+    motion = moved(free, rollouts)
     noise = np.asarray(motion.noise[0])
     np.testing.assert_allclose(noise.std(), 0.1, rtol=0.1)
     np.testing.assert_allclose(noise.mean(), 0, atol=0.015)
@@ -152,9 +154,9 @@ def test_noise_on_the_input_walks_as_it_should(pendulums):
 
 def test_noise_on_the_velocity_reaches_the_controller_through_the_gain(pendulums):
     elite = pendulums.elites[0]
-    lanes = lanes_of(pendulums, [0], [elite.x[0]])
-    quiet = moved(pendulums, dataclasses.replace(lanes, period=jnp.full(COUNT, CHUNK)))
-    noisy = dataclasses.replace(lanes, velocity_noise=jnp.full((1, COUNT), 0.01), period=jnp.full(COUNT, CHUNK))
+    rollouts = rollouts_of(pendulums, [0], [elite.x[0]])
+    quiet = moved(pendulums, dataclasses.replace(rollouts, period=jnp.full(COUNT, CHUNK)))
+    noisy = dataclasses.replace(rollouts, velocity_noise=jnp.full((1, COUNT), 0.01), period=jnp.full(COUNT, CHUNK))
     spread = np.asarray(moved(pendulums, noisy).command - quiet.command)
     np.testing.assert_allclose(spread.std(), 0.01 * abs(elite.K[0, 0, 1]), rtol=0.1)
 
@@ -164,17 +166,17 @@ def test_a_lane_that_leaves_the_limits_stays_where_it_did_and_harms_nobody(pendu
     beyond = elite.state_limits[1] * np.array([0.0, 1.0]) + np.array([np.pi, 1e-3])
     bad = np.array([np.nan, 0.0])
     x = np.stack([elite.x[0], elite.x_goal, beyond, bad])
-    motion = moved(pendulums, lanes_of(pendulums, np.zeros(4, int), x))
+    motion = moved(pendulums, rollouts_of(pendulums, np.zeros(4, int), x))
     np.testing.assert_array_equal(motion.left[:4], [False, False, True, True])
-    alone = moved(pendulums, lanes_of(pendulums, [0], [elite.x[0]]))
+    alone = moved(pendulums, rollouts_of(pendulums, [0], [elite.x[0]]))
     np.testing.assert_array_equal(motion.x[:, 0], alone.x[:, 0])
-    later = moved(pendulums, lanes_of(pendulums, np.zeros(4, int), x), chunks=2)
+    later = moved(pendulums, rollouts_of(pendulums, np.zeros(4, int), x), chunks=2)
     np.testing.assert_array_equal(later.x[:, 2], motion.x[:, 2])
 
 
 def test_noises_are_those_of_the_key(pendulums):
-    lanes = lanes_of(pendulums, [0], [pendulums.elites[0].x[0]])
-    noisy = dataclasses.replace(lanes, input_noise=jnp.full((1, COUNT), 0.1))
+    rollouts = rollouts_of(pendulums, [0], [pendulums.elites[0].x[0]])
+    noisy = dataclasses.replace(rollouts, input_noise=jnp.full((1, COUNT), 0.1))
     one, again = moved(pendulums, noisy), moved(pendulums, noisy)
     np.testing.assert_array_equal(one.x, again.x)
     assert not np.array_equal(one.x, moved(pendulums, noisy, key=jax.random.key(1)).x)
