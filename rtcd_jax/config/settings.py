@@ -2,7 +2,7 @@
 
 import re
 from collections.abc import Iterable, Iterator
-from typing import Self, get_args
+from typing import Literal, Self, get_args, get_origin
 
 from pydantic import BaseModel, ConfigDict, ValidationError, model_validator
 from pydantic.fields import FieldInfo
@@ -42,7 +42,8 @@ class Settings(BaseModel):
         try:
             settings = handler(data)
         except ValidationError as error:
-            raise invalid(_taught(cls, details) for details in error.errors()) from None
+            problems = [_taught(cls, details) for details in error.errors()]
+            raise invalid({(p.path, p.text): p for p in problems}.values()) from None  # a union's kinds say one thing
         problems = tuple(settings.problems())
         if problems:
             raise invalid(problems)
@@ -103,12 +104,20 @@ def _taught(model: type[Settings], details: ErrorDetails) -> Problem:
     if kind == "extra_forbidden":
         return Problem(path, f"unknown key; {closest(path[0], tuple(model.model_fields))}", details["input"])
     field = model.model_fields[str(path[0])]
+    if names := _names_beside_numbers(field):
+        return Problem(path[:1], f"must be {bounds(field)}, or {names}; {field.description}", details["input"])
     if kind == "literal_error":
         return Problem(path, f"unknown name; {closest(details['input'], get_args(field.annotation))}", details["input"])
     meaning = f"; {field.description}" if field.description else ""
     if kind == "missing":
         return Problem(path, f"is missing{meaning}")
     return Problem(path, f"{_expectation(field, details)}{meaning}", details["input"])
+
+
+def _names_beside_numbers(field: FieldInfo) -> str:
+    """Of a field that takes a number or one of some names, the names."""
+    kinds = [kind for kind in get_args(field.annotation) if get_origin(kind) is Literal]
+    return " or ".join(repr(name) for kind in kinds for name in get_args(kind))
 
 
 def _expectation(field: FieldInfo, details: ErrorDetails) -> str:

@@ -279,6 +279,12 @@ def test_both_sides_of_every_range(key, inside, outside):
     assert "must" in line
 
 
+def test_a_number_or_a_name():
+    assert parse(changed({"search.chunk": "auto"})).search.chunk == "auto"
+    (line,) = errors({"search.chunk": "most"})
+    assert line.startswith("search.chunk = 'most': must be >= 1 and <= 1048576, or 'auto'; candidates")
+
+
 def test_nested_population_from_its_smallest():
     assert errors({"search": {"mode": "nested", "population": 32}}) == []
     assert errors({"search": {"mode": "joint", "population": 100}}) == []
