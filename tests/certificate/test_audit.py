@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from rtcd_jax.analysis.disturb.comparison import read_contest
+from rtcd_jax.analysis.disturb.comparison import read_comparison
 from rtcd_jax.certificate import check
 from rtcd_jax.certificate.audit.external import Cost, elite_of, read_external
 from rtcd_jax.certificate.audit.projection import defects, projected, with_fitting_inputs
@@ -338,9 +338,9 @@ def test_animate_reads_the_audited_folder(audited):
 
 
 def test_disturb_reads_the_audited_folder(audited):
-    contest = read_contest(audited, silent())
-    assert contest.names == ("initial", "best")
-    assert {elite.guarantee for elite in contest.elites} == {"claimed"}
+    comparison = read_comparison(audited, silent())
+    assert comparison.names == ("initial", "best")
+    assert {elite.guarantee for elite in comparison.elites} == {"claimed"}
 
 
 @pytest.mark.skipif(not REFERENCE.is_file(), reason="RTCD_REFERENCE names no folder with pendulum_initial.csv")
