@@ -85,8 +85,7 @@ def _keep_programs(folder: str) -> None:
         return
     jax.config.update("jax_compilation_cache_dir", folder)
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)
-    if find_spec("filelock"):  # JAX bounds the size only with it
-        jax.config.update("jax_compilation_cache_max_size", CACHE_SIZE)
+    jax.config.update("jax_compilation_cache_max_size", CACHE_SIZE)
 
 
 def require_devices() -> None:

@@ -105,6 +105,16 @@ def test_a_case_that_is_not_there_cannot_be_asked_for(tmp_path, capsys):
     assert "0/60" in capsys.readouterr().out
 
 
+def test_a_list_of_the_cases_writes_nothing(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    path = written(tmp_path, {"product": {"search.seed": [0, 1]}})
+    before = sorted(tmp_path.rglob("*"))
+    for folder in ([], ["--folder", "runs"]):
+        assert cli.main(["sweep", str(path), "--list", *folder]) == 0
+    assert "0/60" in capsys.readouterr().out
+    assert sorted(tmp_path.rglob("*")) == before
+
+
 def test_cases_run_one_after_another_and_the_rest_goes_on_after_one_that_fails(tmp_path, capsys, monkeypatch):
     import sys
     import types

@@ -82,6 +82,9 @@ def test_a_cpu_is_no_substitute_for_the_gpus_of_a_job(tmp_path, environment, cod
     assert (done.returncode, done.stderr.count("\n")) == (code, 1), done.stderr
     assert done.stderr.startswith(text)
     assert not (tmp_path / "run").exists()
+    done = python(main, "disturb", tmp_path, **environment)
+    assert (done.returncode, done.stderr.count("\n")) == (code, 1), done.stderr
+    assert done.stderr.startswith(text)
 
 
 def test_programs_are_kept_in_the_users_cache_unless_told_otherwise(tmp_path):

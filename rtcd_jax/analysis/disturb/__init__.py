@@ -14,6 +14,7 @@ from rtcd_jax.analysis.disturb.experiments import FACTORS, SIZES, TIMES, impulse
 from rtcd_jax.analysis.disturb.figures import draw_disturbance
 from rtcd_jax.analysis.disturb.scenarios import Outcome, Rollouts
 from rtcd_jax.system.console import Console
+from rtcd_jax.system.devices import require_devices
 from rtcd_jax.system.files import make_folder, replace_json
 
 FOLDER = "disturbance"
@@ -23,8 +24,10 @@ def disturb_run(folder: Path, states: int, seed: int, console: Console) -> None:
     """Runs all experiments; stores `disturbance/{off_nominal,impulse,robustness}.json` and their figures.
 
     Raises:
-        UserError: no run folder, a run without elites, or a folder that cannot be read or written.
+        UserError: no run folder, a run without elites, a folder that cannot be read or written, or other devices than
+            JAX_PLATFORMS or Slurm says.
     """
+    require_devices()
     comparison = read_comparison(folder, console)
     place = folder / FOLDER
     make_folder(place)

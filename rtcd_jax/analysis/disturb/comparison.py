@@ -1,5 +1,6 @@
 """The controllers that are compared, and their rollouts in batches, with progress."""
 
+import contextlib
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -66,6 +67,10 @@ class Meter:
         self._done = self._told = 0.0
         self._clock = Clock()
 
+    def compiling(self) -> contextlib.AbstractContextManager[None]:
+        """Around a chunk of the rollouts: the first one compiles, which the console says until it is over."""
+        return contextlib.nullcontext() if self._done else self._console.waiting("compiling the rollouts")
+
     def tick(self, experiment: str, motions: float) -> None:
         """That so many more motions are over."""
         self._done += motions
@@ -111,7 +116,7 @@ def run(comparison: Comparison, rollouts: Rollouts, seed: int, experiment: str, 
         which = np.minimum(begin + np.arange(BATCH), count - 1)
         batch = jax.tree.map(lambda leaf, which=which: leaf[..., which], rollouts)
         key = jax.random.fold_in(jax.random.key(seed), index)
-        part = _run_batch(comparison, batch, key, settles, lambda share: meter.tick(experiment, BATCH * share))
+        part = _run_batch(comparison, batch, key, settles, meter, experiment)
         real = min(BATCH, count - begin)
         parts.append([np.asarray(leaf)[:real] for leaf in part])
     return Outcome(*(np.concatenate(leaves) for leaves in zip(*parts, strict=True)))
@@ -122,18 +127,21 @@ def motions(rollouts: int) -> int:
     return BATCH * math.ceil(rollouts / BATCH)
 
 
-def _run_batch(comparison: Comparison, batch: Rollouts, key, settles: bool, tick) -> Outcome:
+def _run_batch(
+    comparison: Comparison, batch: Rollouts, key: jax.Array, settles: bool, meter: Meter, experiment: str
+) -> Outcome:
     total, watched = steps_of(comparison.horizon), steps_of(WATCHED)
     quiet = _quiet_from(comparison, batch)
     motion, held = start(comparison.loops, batch), jnp.zeros(batch.loop.shape)
     final = held
     for first in range(0, total, CHUNK):
-        motion = advance(comparison.loops, batch, motion, jnp.asarray(first), key)
-        final = comparison.loops.distance(batch.loop, motion.x)
+        with meter.compiling():
+            motion = advance(comparison.loops, batch, motion, jnp.asarray(first), key)
+            final = comparison.loops.distance(batch.loop, motion.x)
         if first + CHUNK > total - watched:
             held = jnp.maximum(held, final)
         over = settles and first * STEP > quiet and bool(jnp.all(motion.left | (final <= FORGOTTEN * ARRIVED)))
-        tick((total - first if over else CHUNK) / total)
+        meter.tick(experiment, BATCH * (total - first if over else CHUNK) / total)
         if over:
             held = final
             break

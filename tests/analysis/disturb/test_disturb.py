@@ -2,6 +2,8 @@
 
 import json
 import shutil
+import time
+from functools import partialmethod
 
 import numpy as np
 import pytest
@@ -15,18 +17,12 @@ from rtcd_jax.analysis.disturb.scenarios import undisturbed
 from rtcd_jax.elite.closed_loop import runge_kutta, simulate
 from rtcd_jax.elite.records import read_elite, write_elite
 from rtcd_jax.elite.simulators import simulators_of
+from rtcd_jax.system.console import Console, silent
 from rtcd_jax.system.errors import UserError
 from tests.consoles import Screen
 from tests.export.folders import run_folder
 
 NAMES = ("off_nominal", "impulse", "robustness")
-
-
-class NoMeter:
-    """A meter that nobody reads."""
-
-    def tick(self, experiment, motions):
-        pass
 
 
 SMALL = {
@@ -98,7 +94,7 @@ def test_verdicts_are_the_verifications(tmp_path):
     x = elite.points(np.zeros(60, int), np.random.default_rng(0))
     x[::2] = elite.x[0] + 3 * (x[::2] - elite.x[0])
     rollouts = undisturbed(comparison.plant, comparison.design, np.ones(60, int), x.T)
-    found = run(comparison, rollouts, 0, "", NoMeter(), settles=True)
+    found = run(comparison, rollouts, 0, "", Meter(silent(), 1), settles=True)
     simulator = next(simulators_of(elite, 60))
     seen = simulate(elite, simulator.dynamics, runge_kutta(simulator.dynamics, 2e-3), np.zeros(60, int), x)
     lost = found.left_limits | ~(found.final <= 1e-3)
@@ -110,7 +106,7 @@ def test_a_batch_that_may_end_early_gives_the_verdicts_of_one_that_may_not(pendu
     elite = pendulums.elites[0]
     x = elite.points(np.zeros(40, int), np.random.default_rng(2))
     rollouts = undisturbed(pendulums.plant, pendulums.design, np.zeros(40, int), x.T)
-    early, late = (run(pendulums, rollouts, 0, "", NoMeter(), settles) for settles in (True, False))
+    early, late = (run(pendulums, rollouts, 0, "", Meter(silent(), 1), settles) for settles in (True, False))
     np.testing.assert_array_equal(early.left_limits, late.left_limits)
     np.testing.assert_array_equal(early.final <= 1e-3, late.final <= 1e-3)
     assert np.all(late.final[~late.left_limits] <= late.held[~late.left_limits])
@@ -120,9 +116,26 @@ def test_batches_are_full_and_outcomes_are_as_many_as_lanes(pendulums):
     assert [motions(count) for count in (1, 256, 257)] == [256, 256, 512]
     x = np.tile(pendulums.elites[0].x[0], (259, 1))
     rollouts = undisturbed(pendulums.plant, pendulums.design, np.zeros(259, int), x.T)
-    outcome = run(pendulums, rollouts, 0, "", NoMeter(), settles=True)
+    outcome = run(pendulums, rollouts, 0, "", Meter(silent(), 1), settles=True)
     assert outcome.final.shape == (259,)
     np.testing.assert_array_equal(outcome.final, outcome.final[0])
+
+
+def test_until_the_first_chunk_is_over_the_console_says_that_its_program_compiles(monkeypatch):
+    monkeypatch.setattr(Console, "waiting", partialmethod(Console.waiting, every=0.01))
+    screen = Screen()
+    meter = Meter(screen.console, 256)
+    with meter.compiling():
+        deadline = time.monotonic() + 20
+        while "compiling the rollouts  elapsed 0:0" not in screen.text and time.monotonic() < deadline:
+            time.sleep(0.01)
+    told = screen.text
+    assert "compiling the rollouts  elapsed 0:0" in told
+    meter.tick("impulse", 1)
+    told = screen.text
+    with meter.compiling():
+        time.sleep(0.05)
+    assert screen.text == told
 
 
 def test_an_initial_candidate_without_a_funnel_is_left_out(tmp_path):
