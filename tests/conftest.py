@@ -1,5 +1,7 @@
 """Tests run in float64 on the CPU, with a cache folder of their own."""
 
+import os
+
 import jax
 import pytest
 
@@ -11,3 +13,20 @@ def _cache_of_its_own(tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.mktemp("cache")))
         yield
+
+
+@pytest.fixture(scope="session")
+def backend():
+    """A way in which MuJoCo draws without a display."""
+    from rtcd_jax.analysis.animate.camera import choose_backend
+    from rtcd_jax.system.errors import UserError
+
+    kept = os.environ.pop("MUJOCO_GL", None)
+    try:
+        return choose_backend()
+    except UserError as error:
+        pytest.skip(str(error))
+    finally:
+        os.environ.pop("MUJOCO_GL", None)
+        if kept is not None:
+            os.environ["MUJOCO_GL"] = kept

@@ -54,9 +54,9 @@ ALONE = {
 # Modules that must start fast, so that wrong input is refused at once.
 QUICK = (
     "cli.main",
-    "cli.search_options",
-    "cli.run_options",
-    "cli.proof_options",
+    "cli.search_verbs",
+    "cli.options",
+    "cli.run_verbs",
     "config",
     "config.load",
     "config.schema",
@@ -91,7 +91,8 @@ def imported(tree, top_level_only=False):
 
 def _executed_on_import(tree):
     for node in ast.iter_child_nodes(tree):
-        if not isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.Lambda):
+        for_types = isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING"
+        if not for_types and not isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.Lambda):
             yield node
             yield from _executed_on_import(node)
 

@@ -17,7 +17,7 @@ from collections.abc import Callable
 from concurrent.futures import BrokenExecutor
 from typing import NoReturn, Self
 
-from rtcd_jax.system.errors import UserError, printable
+from rtcd_jax.system.errors import UserError, printable, printable_lines
 from rtcd_jax.system.processes import end_workers
 
 GRACE = 1.0
@@ -89,7 +89,7 @@ def _about_devices(error: BaseException) -> bool:
 def say(text: str) -> None:
     """Lines on stderr, printable whatever they quote; nothing where nobody reads them."""
     with contextlib.suppress(OSError, ValueError):
-        print("\n".join(map(printable, text.split("\n"))), file=sys.stderr, flush=True)
+        print(printable_lines(text), file=sys.stderr, flush=True)
 
 
 def _leave(code: int) -> NoReturn:

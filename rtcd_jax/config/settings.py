@@ -55,6 +55,12 @@ def invalid(problems: Iterable[Problem]) -> ValidationError:
     return ValidationError.from_exception_data("configuration", [_line(problem) for problem in problems])
 
 
+def refusal(text: str, shown: bool = True) -> PydanticCustomError:
+    """What a field's validator raises to say in its own words what is wrong with a value, shown or not."""
+    # The text travels in the context: pydantic would expand braces in a message template.
+    return PydanticCustomError("problem", "{text}", {"text": text, "shown": shown})
+
+
 def problems_of(error: ValidationError) -> list[Problem]:
     """The inverse of `invalid`."""
     return [_problem(details) for details in error.errors()]
@@ -84,9 +90,8 @@ def _number(limit: float) -> str:
 
 
 def _line(problem: Problem) -> InitErrorDetails:
-    # The text travels in the context: pydantic would expand braces in a message template.
-    kind = PydanticCustomError("problem", "{text}", {"text": problem.text, "shown": problem.value is not NO_VALUE})
-    return InitErrorDetails(type=kind, loc=problem.path, input=None if problem.value is NO_VALUE else problem.value)
+    shown = problem.value is not NO_VALUE
+    return InitErrorDetails(type=refusal(problem.text, shown), loc=problem.path, input=problem.value if shown else None)
 
 
 def _problem(details: ErrorDetails) -> Problem:

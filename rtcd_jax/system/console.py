@@ -16,6 +16,8 @@ from rich.progress import BarColumn, TextColumn
 from rich.progress import Progress as Bar
 from rich.table import Table
 
+from rtcd_jax.system.errors import printable, printable_lines
+
 WIDTH = 150
 """Characters of a table's row at most; longer cells are wrapped."""
 
@@ -82,8 +84,8 @@ class Console:
             self._bar = None
 
     def message(self, text: str) -> None:
-        """A line that stays; on a terminal above the live one."""
-        self._terminal.print(text, soft_wrap=True, highlight=False, markup=False, emoji=False)
+        """Lines that stay; on a terminal above the live one. They only show what they quote: no terminal obeys it."""
+        self._terminal.print(printable_lines(text), soft_wrap=True, highlight=False, markup=False, emoji=False)
         self._terminal.file.flush()
 
     def progress(self, now: Progress) -> None:
@@ -97,7 +99,8 @@ class Console:
             self._bar.add_task("")
             self._bar.start()
         task = self._bar.task_ids[0]
-        self._bar.update(task, completed=now.done, total=now.total, description=now.text, refresh=True)
+        text = printable(now.text)
+        self._bar.update(task, completed=now.done, total=now.total, description=text, refresh=True)
 
     @contextlib.contextmanager
     def waiting(self, text: str, every: float = WAITING) -> Iterator[None]:

@@ -30,20 +30,24 @@ class UserError(ValueError):
 
 
 class ConfigError(UserError):
-    """Everything that is wrong with a configuration, at once: a line, or one each under a heading, twenty at most."""
+    """Everything that is wrong with a configuration or options: a line, or one each under a heading, twenty at most.
+
+    `source` is the file that it stands in; empty for the command line.
+    """
 
     def __init__(self, problems: Iterable[Problem], source: str = "configuration"):
         self.problems = tuple(problems)
         self.source = source
         first, *others = self.problems
+        where = f"{source}: " if source else ""
         told = [
-            f"{source}: {len(self.problems)} errors",
+            f"{where}{len(self.problems)} errors",
             *(f"  {problem}" for problem in self.problems[:_MOST_PROBLEMS]),
         ]
         if len(self.problems) > _MOST_PROBLEMS:
             told.append(f"  and {len(self.problems) - _MOST_PROBLEMS} more")
         if not others:
-            told = [f"{source}: {first if first.path or first.value is not NO_VALUE else first.text}"]
+            told = [f"{where}{first if first.path or first.value is not NO_VALUE else first.text}"]
         super().__init__("\n".join(told))
 
     def __reduce__(self) -> tuple[type[Self], tuple[tuple[Problem, ...], str]]:
@@ -69,3 +73,8 @@ def printable(text: object, longest: int | None = None) -> str:
     if longest is not None and len(shown) + (len(str(text)) > longest) > longest:
         shown = shown[: longest - 1] + "…"
     return shown
+
+
+def printable_lines(text: str) -> str:
+    """The same for text of several lines, which stay lines."""
+    return "\n".join(printable(line) for line in text.split("\n"))

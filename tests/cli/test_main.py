@@ -1,16 +1,19 @@
 """The command line as a user meets it: exit codes, messages, help, and what reaches the run."""
 
 import contextlib
+import importlib
+import inspect
 import re
 import subprocess
 import sys
-import types
 from pathlib import Path
 
 import pytest
 
 from rtcd_jax.cli import main as cli
-from rtcd_jax.config.load import Config, load, resolved
+from rtcd_jax.cli.options import FLAT
+from rtcd_jax.cli.search_verbs import OptimizeOptions
+from rtcd_jax.config.load import load, resolved
 from rtcd_jax.system.devices import cores
 from tests.paths import ROOT
 
@@ -160,21 +163,7 @@ def test_yaml_syntax(tmp_path):
     assert "no valid YAML: line " in errors
 
 
-@pytest.fixture
-def run_module(monkeypatch):
-    """Stands in for the run: records what the command line hands over."""
-    calls = []
-    module = types.ModuleType("rtcd_jax.run.optimize")
-    module.optimize = lambda config, folder, console, cluster: calls.append((config, folder)) or True
-    monkeypatch.setitem(sys.modules, "rtcd_jax.run.optimize", module)
-    monkeypatch.setattr(cli, "prepare_jax", lambda *_: None)
-    monkeypatch.setattr("rtcd_jax.analysis.report.report", lambda folders, **_: (folders[0] / "report.html",) * 2)
-    monkeypatch.setattr("rtcd_jax.system.cluster.Cluster.heed", lambda cluster: None)  # signals stay pytest's
-    module.calls = calls
-    return module
-
-
-def test_overrides_reach_the_run(run_module):
+def test_overrides_are_the_configuration_s():
     overrides = {
         "search.population": 512,
         "search.objective": "inlet",
@@ -184,10 +173,9 @@ def test_overrides_reach_the_run(run_module):
         "task.state_limits": ["inf", 7],
     }
     words = [word for key, value in overrides.items() for word in (f"--{key}", *map(str, _listed(value)))]
-    assert cli.main(["optimize", RTCD, "--run", "elsewhere", *words, "--design.length.pinned"]) == 0
-    ((config, folder),) = run_module.calls
-    assert isinstance(config, Config)
-    assert folder == Path("elsewhere")
+    words = [RTCD, "--run", "elsewhere", *words, "--design.length.pinned"]
+    options = OptimizeOptions.read(words, "rtcd optimize")
+    assert options.run == Path("elsewhere")
     expected = load(Path(RTCD)).model_dump()
     expected["search"] |= {"population": 512, "objective": "inlet"}
     expected["weights"]["q"][0]["max"] = 10.5
@@ -195,82 +183,77 @@ def test_overrides_reach_the_run(run_module):
     expected["design"]["length"]["pinned"] = True
     expected["trajectory"]["step"]["max"] = 0.05
     expected["task"]["state_limits"] = (float("inf"), 7.0)
-    assert config.model_dump() == expected
+    assert options.config.model_dump() == expected
 
 
 def _listed(value):
     return value if isinstance(value, list) else [value]
 
 
-def test_without_overrides_the_file_is_the_run(run_module):
-    assert cli.main(["optimize", RTCD]) == 0
-    assert run_module.calls == [(load(Path(RTCD)), Path("checkpoints/pendulum_rtcd"))]
+def test_without_overrides_the_file_is_the_run():
+    options = OptimizeOptions.read([RTCD], "rtcd optimize")
+    assert (options.config, options.run) == (load(Path(RTCD)), Path("checkpoints/pendulum_rtcd"))
 
 
-def test_interruption_says_how_to_go_on(run_module, capsys):
-    def interrupted(*_):
-        raise KeyboardInterrupt
-
-    run_module.optimize = interrupted
-    assert cli.main(["optimize", RTCD]) == 130
-    assert capsys.readouterr().err == "stopped; run the same command to go on\n"
-
-
-@pytest.mark.parametrize(("held", "code"), [(True, 0), (False, 1)])
-def test_verify_exits_by_the_promise(monkeypatch, tmp_path, held, code):
-    calls = []
-    module = types.ModuleType("rtcd_jax.analysis.verify.run")
-    module.verify_run = lambda folder, states, seed, workers, console: calls.append((folder, states, seed)) or held
-    monkeypatch.setitem(sys.modules, "rtcd_jax.analysis.verify.run", module)
-    monkeypatch.setattr(cli, "prepare_jax", lambda *_: None)
-    assert cli.main(["verify", str(tmp_path), "--states", "10", "--seed", "3"]) == code
-    assert calls == [(tmp_path, 10, 3)]
-
-
-def test_a_page_that_cannot_be_brought_up_to_date_ends_nothing(monkeypatch, tmp_path, capsys):
-    module = types.ModuleType("rtcd_jax.analysis.verify.run")
-    module.verify_run = lambda *_: True
-    monkeypatch.setitem(sys.modules, "rtcd_jax.analysis.verify.run", module)
-    monkeypatch.setattr(cli, "prepare_jax", lambda *_: None)
-    assert cli.main(["verify", str(tmp_path)]) == 0
-    assert capsys.readouterr().out == ""
-    (tmp_path / "report.html").touch()
-    assert cli.main(["verify", str(tmp_path)]) == 0
-    told = capsys.readouterr().out
-    assert (
-        told == f"{tmp_path}/report.html does not show this yet: {tmp_path} is no run folder: it has no format.json\n"
-    )
-
-
-def test_a_failing_report_ends_nothing(run_module, tmp_path, monkeypatch, capsys):
-    """The run is finished; what went wrong is told, with the command that tries again."""
-
-    def broken(*_, **__):
-        raise RuntimeError("no fonts")
-
-    monkeypatch.setattr("rtcd_jax.analysis.report.report", broken)
-    assert cli.main(["optimize", RTCD, "--run", str(tmp_path)]) == 0
-    assert capsys.readouterr().out == (
-        f"the run is finished, but its report failed: RuntimeError('no fonts'); `rtcd report {tmp_path}` makes it\n"
-    )
+ALL_WRONG = {
+    "verify": (
+        ["no/such/run", "--states", "0", "--seed", "-1"],
+        ["no/such/run: no such run folder", "--states = 0: must be >= 1", "--seed = -1: must be >= 0"],
+    ),
+    "replay": (
+        ["configs", "x.csv", "--elite", "-1", "--start", "nan"],
+        ["--elite = -1: must be >= 0, or initial", "--start = nan: must be finite"],
+    ),
+    "audit": (
+        [
+            *("x.csv", "--plant", "pendulum", "--parameters", "m=1", "l", "b=x"),
+            *("--q", "1", "nan", "--r", "1", "--out", "out", "--states", "0"),
+        ],
+        [
+            "--parameters l: must be NAME=VALUE with a number", "--parameters b=x: must be NAME=VALUE",
+            "--q nan: must be finite", "--states = 0: must be >= 1",
+        ],
+    ),
+    "scale": (
+        [RTCD, "--populations", "3,64", "--devices", "0", "--repeats", "0"],
+        [
+            "--populations = '3,64': all must be >= 4", "--devices = '0': all must be >= 1",
+            "--repeats = 0: must be >= 1",
+        ],
+    ),
+    "optimize": (
+        [RTCD, "--search.population", "3", "--task.start", "1", "--devices", "0", "--process_id", "-1"],
+        [
+            "--search.population = 3: must be >= 4", "--task.start: must have 2 entries", "--devices = 0: must be >= 1",
+            "--process_id = -1: must be >= 0",
+        ],
+    ),
+}  # fmt: skip
 
 
-@pytest.mark.parametrize(("kept", "code"), [(True, 0), (False, 1)])
-def test_replay_exits_by_the_funnel(monkeypatch, tmp_path, kept, code):
-    calls = []
-    module = types.ModuleType("rtcd_jax.analysis.replay.replay")
-    module.replay_run = lambda folder, file, elite, *_: calls.append((folder, file, elite)) or kept
-    monkeypatch.setitem(sys.modules, "rtcd_jax.analysis.replay.replay", module)
-    for elite in ("2", "initial"):
-        assert cli.main(["replay", str(tmp_path), "lab.csv", "--elite", elite]) == code
-    assert calls == [(tmp_path, Path("lab.csv"), 2), (tmp_path, Path("lab.csv"), "initial")]
+@pytest.mark.parametrize("verb", ALL_WRONG)
+def test_all_wrong_options_are_told_at_once(verb, capsys):
+    arguments, words = ALL_WRONG[verb]
+    assert cli.main([verb, *arguments]) == 2
+    heading, *lines = capsys.readouterr().err.splitlines()
+    assert heading == f"rtcd: {len(words)} errors"
+    assert all(line.startswith(f"  {start}") for line, start in zip(lines, words, strict=True)), lines
+
+
+@pytest.mark.parametrize("verb", sorted(cli.VERBS.keys() - {"check"}))
+def test_every_option_has_a_meaning_and_every_number_a_unit(verb):
+    module, _, name = cli.VERBS[verb].function.partition(":")
+    model = next(iter(inspect.signature(getattr(importlib.import_module(module), name)).parameters.values())).annotation
+    for option, field in model.model_fields.items():
+        assert field.description or FLAT in field.metadata, option
+        if field.annotation in (int, float):
+            assert "[" in field.description or "process" in field.description, option
 
 
 @pytest.mark.parametrize(
     ("verb", "arguments"), [("report", ["."]), ("animate", ["."]), ("replay", [".", "measured.csv"])]
 )
-def test_what_is_no_run_folder_is_told_in_one_line(verb, arguments, tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(cli, "prepare_jax", lambda: None)
+def test_what_is_no_run_folder_is_told_in_one_line(verb, arguments, tmp_path, capsys, monkeypatch, as_in_a_process):
     monkeypatch.chdir(tmp_path)
     assert cli.main([verb, *arguments]) == 2
     assert capsys.readouterr().err == "rtcd: . is no run folder: it has no format.json\n"
@@ -283,31 +266,6 @@ def test_help_has_an_example(verb, capsys):
     text = flat(capsys.readouterr().out)
     assert f"Example: rtcd {verb} " in text
     assert "None" not in text  # but what holds where an option is left away
-
-
-def _standing_in(monkeypatch, name, verb):
-    """The module in the place of the one that the verb imports, and the calls that it gets."""
-    calls = []
-    module = types.ModuleType(f"rtcd_jax.{name}")
-    setattr(module, verb, lambda *arguments: calls.append(arguments[:-1]))
-    monkeypatch.setitem(sys.modules, f"rtcd_jax.{name}", module)
-    monkeypatch.setattr(cli, "prepare_jax", lambda: None)
-    return calls
-
-
-def test_export_hands_on_the_elite_and_the_folder(monkeypatch, tmp_path):
-    calls = _standing_in(monkeypatch, "export", "export_run")
-    assert cli.main(["export", str(tmp_path), "--to", "lab"]) == 0
-    assert cli.main(["export", str(tmp_path), "--to", "lab", "--elite", "3"]) == 0
-    assert cli.main(["export", str(tmp_path), "--to", "lab", "--elite", "initial"]) == 0
-    assert [call[:3] for call in calls] == [(tmp_path, elite, Path("lab")) for elite in (0, 3, "initial")]
-
-
-def test_disturb_hands_on_states_and_seed(monkeypatch, tmp_path):
-    calls = _standing_in(monkeypatch, "analysis.disturb", "disturb_run")
-    assert cli.main(["disturb", str(tmp_path)]) == 0
-    assert cli.main(["disturb", str(tmp_path), "--states", "10", "--seed", "3"]) == 0
-    assert calls == [(tmp_path, 1000, 0), (tmp_path, 10, 3)]
 
 
 PREPARED = """
@@ -344,22 +302,14 @@ def test_help_imports_nothing_but_the_standard_library():
     assert process.stdout.splitlines()[-1] == "set()"
 
 
-def test_asked_to_stop_a_run_leaves_with_the_exit_code_for_that(run_module, capsys, monkeypatch):
-    from rtcd_jax.system.cluster import Preempted
-
-    def asked(*arguments):
-        raise Preempted
-
-    run_module.optimize = asked
-    assert cli.main(["optimize", RTCD]) == 85
-    assert "saved in checkpoints/pendulum_rtcd; the same command goes on" in capsys.readouterr().out
-
-
 @pytest.mark.parametrize(
     ("options", "message"),
     [
         (["--devices", "0"], r"--devices = 0: must be >= 1"),
-        (["--coordinator", "a:1"], r"--num_processes, --process_id: must be given too"),
+        (
+            ["--coordinator", "a:1"],
+            r"2 errors\n  --num_processes: must be given too; .*\n  --process_id: must be given",
+        ),
         (["--coordinator", "a:1", "--num_processes", "2", "--process_id", "2"], r"must be < --num_processes = 2"),
     ],
 )

@@ -113,29 +113,3 @@ def test_a_list_of_the_cases_writes_nothing(tmp_path, monkeypatch, capsys):
         assert cli.main(["sweep", str(path), "--list", *folder]) == 0
     assert "0/60" in capsys.readouterr().out
     assert sorted(tmp_path.rglob("*")) == before
-
-
-def test_cases_run_one_after_another_and_the_rest_goes_on_after_one_that_fails(tmp_path, capsys, monkeypatch):
-    import sys
-    import types
-
-    ran = []
-
-    def optimize(config, folder, console, cluster):
-        ran.append((config.search.seed, folder.name))
-        if config.search.seed == 0:
-            raise UserError("nothing is feasible")
-
-    module = types.ModuleType("rtcd_jax.run.optimize")
-    module.optimize = optimize
-    monkeypatch.setitem(sys.modules, "rtcd_jax.run.optimize", module)
-    monkeypatch.setattr(cli, "prepare_jax", lambda *_: None)
-    monkeypatch.setattr("rtcd_jax.system.cluster.Cluster.heed", lambda cluster: None)
-    path = written(tmp_path, {"product": {"search.seed": [0, 1]}})
-    assert cli.main(["sweep", str(path), "--folder", str(tmp_path / "runs")]) == 2
-    assert ran == [(0, "000_seed=0"), (1, "001_seed=1")]
-    told = capsys.readouterr()
-    assert "case 0 ended early: nothing is feasible" in told.out
-    assert "1 of the cases ended early, see above: 000_seed=0" in told.err
-    assert cli.main(["sweep", str(path), "--folder", str(tmp_path / "runs"), "--case", "1"]) == 0
-    assert ran[2:] == [(1, "001_seed=1")]

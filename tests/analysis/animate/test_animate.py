@@ -25,20 +25,6 @@ def rtcd(*arguments, **environment):
     return subprocess.run(command, cwd=ROOT, env=told, capture_output=True, text=True)
 
 
-@pytest.fixture(scope="module")
-def backend():
-    """A way of drawing without a display."""
-    kept = os.environ.pop("MUJOCO_GL", None)
-    try:
-        return choose_backend()
-    except UserError as error:
-        pytest.skip(str(error))
-    finally:
-        os.environ.pop("MUJOCO_GL", None)
-        if kept is not None:
-            os.environ["MUJOCO_GL"] = kept
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("plant", LOOPS)
 def test_the_videos_show_both_candidates_moving(tmp_path, backend, plant):

@@ -1,0 +1,256 @@
+"""The verbs that read a run or a file beside it: each its options and what it does with them.
+
+The packages that do the work are imported once the options are known to be right.
+"""
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Annotated, Literal
+
+from pydantic import AfterValidator, Field
+
+from rtcd_jax.cli.exits import Exit
+from rtcd_jax.cli.options import Elite, ExistingRun, Options, Positional, Run, shown
+from rtcd_jax.config.settings import refusal
+from rtcd_jax.system.console import Console
+from rtcd_jax.system.devices import cores
+from rtcd_jax.system.errors import Problem
+
+
+def _verdict(held: bool) -> Exit:
+    return Exit.OK if held else Exit.REFUTED
+
+
+class VerifyOptions(Options):
+    """Simulate fresh random states of a run's funnels with independent integrators; exit code 1 if too many fail.
+
+    The same command goes on after a stop.
+
+    Example: rtcd verify checkpoints/pendulum_rtcd --states 100000
+    """
+
+    run: Run = Field(description="the run folder")
+    states: int = Field(
+        default=1000, description="fresh states, over the ellipsoids of all knots, one each at least [-]", ge=1
+    )
+    seed: int = Field(default=0, description="of the states [-]", ge=0)
+    workers: int = Field(default=0, description="processes, 0 for one a core [-]", ge=0)
+
+
+def verify(options: VerifyOptions, console: Console) -> Exit:
+    from rtcd_jax.analysis.verify.run import verify_run
+
+    return _verdict(verify_run(options.run, options.states, options.seed, options.workers or cores(), console))
+
+
+class ReportOptions(Options):
+    """Write a finished run's page, report.html, and its figures; several runs are compared on one page.
+
+    Example: rtcd report checkpoints/pendulum_rtc checkpoints/pendulum_rtcd --to comparison.html
+    """
+
+    runs: Annotated[Positional[tuple[ExistingRun, ...]], shown("RUN [RUN …]")] = Field(description="the run folders")
+    to: Annotated[Path | None, shown("FILE", "in or beside the run")] = Field(default=None, description="the page")
+
+    def problems(self) -> Iterator[Problem]:
+        if not self.runs:
+            yield Problem((), "which run? rtcd report RUN [RUN …] [--to FILE]")
+
+
+def report(options: ReportOptions, console: Console) -> Exit:
+    from rtcd_jax.analysis.report import report as write_report
+
+    page, *figures = write_report(options.runs, options.to, console)
+    console.message(f"{page}, and {len(figures)} figures in {figures[0].parent}")
+    return Exit.OK
+
+
+class AnimateOptions(Options):
+    """Show the swing-up by MuJoCo's renderer as MP4 and GIF: initial beside best, undisturbed and disturbed.
+
+    Needs no display: it draws by EGL or OSMesa.
+
+    Example: rtcd animate checkpoints/pendulum_rtcd --to videos
+    """
+
+    run: Run = Field(description="the run folder")
+    to: Annotated[Path | None, shown("DIR", "animation/ in RUN")] = Field(default=None, description="for the videos")
+    seed: int = Field(default=0, description="of the disturbed start, from the first ellipsoid [-]", ge=0)
+
+
+def animate(options: AnimateOptions, console: Console) -> Exit:
+    from rtcd_jax.analysis.animate.animate import animate_run
+
+    animate_run(options.run, options.to, options.seed, console)
+    return Exit.OK
+
+
+class ReplayOptions(Options):
+    """Was a measured run inside the funnel? V/rho of every sample; exit code 1 if it left.
+
+    FILE is a table of times and states in SI units under a line of column names, which are found by their words
+    (position, vel2, cart_pos, pos_meas1, "Angle [deg]" …). Time counts from the start of the swing-up. Errors of angles
+    are not wrapped.
+
+    Example: rtcd replay checkpoints/pendulum_rtcd measured.csv --start 2.5 --unwrap
+    Example: rtcd replay checkpoints/pendulum_rtcd log.csv --columns time=stamp theta=enc theta_dot=4
+    """
+
+    run: Run = Field(description="the run folder")
+    file: Annotated[Positional[Path], shown("FILE")] = Field(description="the measured states, a CSV file")
+    elite: Elite = Field(default=0, description="whose funnel; 0 is the best [-] (>= 0); or initial")
+    columns: Annotated[tuple[str, ...], shown("NAME=COLUMN …")] = Field(
+        default=(), description="columns of the time and the states, by name or number from 1"
+    )
+    start: Annotated[float | None, shown("T", "0")] = Field(
+        default=None, description="time of the file at which the motion begins [s]"
+    )
+    unwrap: bool = Field(default=False, description="take whole turns out of angles that wrap")
+
+
+def replay(options: ReplayOptions, console: Console) -> Exit:
+    from rtcd_jax.analysis.replay.replay import replay_run
+
+    return _verdict(
+        replay_run(options.run, options.file, options.elite, console, options.columns, options.start, options.unwrap)
+    )
+
+
+class DisturbOptions(Options):
+    """Try the initial candidate and the best elite: off-nominal starts, pushes, wrong models, noise, delay.
+
+    Example: rtcd disturb checkpoints/pendulum_rtcd --states 1000
+    """
+
+    run: Run = Field(description="the run folder")
+    states: int = Field(default=1000, description="uniform states of every first ellipsoid [-]", ge=1)
+    seed: int = Field(default=0, description="of states, noise and perturbations [-]", ge=0)
+
+
+def disturb(options: DisturbOptions, console: Console) -> Exit:
+    from rtcd_jax.analysis.disturb import disturb_run
+
+    disturb_run(options.run, options.states, options.seed, console)
+    return Exit.OK
+
+
+class ExportOptions(Options):
+    """Write an elite for a lab: controller and funnel monitor in Python and C, tables, MJCF and URDF.
+
+    Example: rtcd export checkpoints/pendulum_rtcd --to lab/pendulum
+    """
+
+    run: Run = Field(description="the run folder")
+    to: Annotated[Path, shown("DIR")] = Field(description="a new or empty folder, or a former export, to replace it")
+    elite: Elite = Field(default=0, description="0 is the best [-] (>= 0); or initial")
+    name: Annotated[str | None, shown("NAME", "ROBOT_ELITE")] = Field(
+        default=None, description="of the controller's files and C symbols"
+    )
+
+
+def export(options: ExportOptions, console: Console) -> Exit:
+    from rtcd_jax.export import export_run
+
+    export_run(options.run, options.elite, options.to, console, options.name)
+    return Exit.OK
+
+
+class CertifyOptions(Options):
+    """Prove the funnels of a run's best elites by sums of squares; `rtcd check` checks what this writes.
+
+    Rungs: certified, by the solver's floating-point numbers; proved, by exact arithmetic for the true dynamics. The
+    same command goes on after a kill. Exit code 1 if a funnel was not shown from t = 0 to the goal.
+
+    Example: rtcd certify checkpoints/pendulum_rtcd --elites 8 --optimize_value
+    """
+
+    run: Run = Field(description="the run folder")
+    elites: int = Field(default=1, description="how many, the best first [-]", ge=1)
+    rung: Literal["certified", "proved"] = Field(default="proved", description="how much is to be shown")
+    optimize_value: bool = Field(default=False, description="choose the ellipsoids' shapes too")
+    workers: int = Field(default=0, description="processes, one elite each; 0 for one a core [-]", ge=0)
+
+
+def certify(options: CertifyOptions, console: Console) -> Exit:
+    from rtcd_jax.certificate.prove.run import certify_run
+
+    workers = options.workers or cores()
+    return _verdict(certify_run(options.run, options.elites, options.rung, workers, console, options.optimize_value))
+
+
+def _certificate(path: Path) -> Path:
+    """The best elite's, of a run folder."""
+    return path / "certificates" / "000.json" if path.is_dir() else path
+
+
+class FalsifyOptions(Options):
+    """Simulate motions from the boundary and the inside of what a certificate says is proved, at instants all over it.
+
+    Equations and integrator share nothing with the proof. Exit code 1 if a motion leaves the funnel, a limit or the
+    goal region, beyond the integrator's own error, which is measured. The same command goes on after a kill.
+
+    Example: rtcd falsify checkpoints/pendulum_rtcd/certificates/000.json --rollouts 100000
+    """
+
+    certificate: Annotated[Positional[Path], AfterValidator(_certificate), shown("FILE")] = Field(
+        description="a certificate, or a run folder (its 000)"
+    )
+    rollouts: int = Field(default=1_000_000, description="motions to simulate [-]", ge=1)
+    seed: int = Field(default=0, description="of their starts [-]", ge=0)
+    workers: int = Field(default=0, description="processes, 0 for one a core [-]", ge=0)
+
+
+def falsify(options: FalsifyOptions, console: Console) -> Exit:
+    from rtcd_jax.certificate.falsify.falsify import falsify_file
+
+    return _verdict(
+        falsify_file(options.certificate, options.rollouts, options.seed, options.workers or cores(), console)
+    )
+
+
+def _assignment(text: str) -> str:
+    try:
+        float(text.partition("=")[2])
+    except ValueError:
+        raise refusal("must be NAME=VALUE with a number") from None
+    return text
+
+
+class AuditOptions(Options):
+    """Simulate an external funnel, knot by knot, and project its nominal motion onto the dynamics for a proof.
+
+    FILE is a table: after a row of headings one row a knot, with the time, the states, the input held until the next
+    knot, rho, and the upper triangle of S; or the trajectory alone, and --funnel has rho and all of S. The gains are
+    R^-1 B'S. Exit code 1 if a state left the funnel.
+
+    Example: rtcd audit funnel.csv --plant pendulum --parameters m=0.7 l=0.4 b=0.1 g=9.81 torque_limit=2.5
+    --q 10 1 --r 0.1 --out checkpoints/audit
+    """
+
+    file: Annotated[Positional[Path], shown("FILE")] = Field(description="the trajectory and its funnel")
+    plant: str = Field(description="pendulum or cartpole")
+    parameters: Annotated[tuple[Annotated[str, AfterValidator(_assignment)], ...], shown("NAME=VALUE …")] = Field(
+        description="its physical numbers [SI]"
+    )
+    q: tuple[float, ...] = Field(description="diagonal of the cost's Q [1/(s state's unit^2)]")
+    r: float = Field(description="the cost's R [1/(s input's unit^2)]")
+    out: Annotated[Path, shown("FOLDER")] = Field(description="where the audit and the elites are stored")
+    funnel: Annotated[Path | None, shown("FILE", "in FILE")] = Field(
+        default=None, description="rho and S row by row, a knot a column (or a row)"
+    )
+    state_limits: Annotated[tuple[Annotated[float, Field(allow_inf_nan=True)], ...], shown("LIMIT …", "none")] = Field(
+        default=(), description="largest |x_i|, inf for none [state's unit]"
+    )
+    states: int = Field(default=1000, description="fresh states of each ellipsoid [-]", ge=1)
+    seed: int = Field(default=0, description="of the states [-]", ge=0)
+
+
+def audit(options: AuditOptions, console: Console) -> Exit:
+    from rtcd_jax.certificate.audit.audit import audit_funnel
+    from rtcd_jax.certificate.audit.external import Cost, read_external
+
+    pairs = (text.partition("=") for text in options.parameters)
+    numbers = {name: float(value) for name, _, value in pairs}
+    given = read_external(options.file, options.plant, numbers, options.funnel)
+    cost = Cost.of(given, options.q, options.r, options.state_limits)
+    return _verdict(audit_funnel(given, cost, options.states, options.seed, options.out, console))
