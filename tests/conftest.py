@@ -5,6 +5,10 @@ import os
 import jax
 import pytest
 
+from tests.cli.terminal import in_terminal
+from tests.paths import ROOT
+from tests.run.small import Small
+
 jax.config.update("jax_enable_x64", True)
 
 
@@ -13,6 +17,18 @@ def _cache_of_its_own(tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.mktemp("cache")))
         yield
+
+
+@pytest.fixture(scope="session")
+def small(tmp_path_factory):
+    return Small(tmp_path_factory.mktemp("small"))
+
+
+@pytest.fixture(scope="session")
+def searched(small, tmp_path_factory):
+    """The folder of an uninterrupted search in a terminal, its exit code, and what the terminal was sent."""
+    folder = tmp_path_factory.mktemp("runs") / "whole"
+    return folder, *in_terminal("optimize", small.config, "--run", folder, folder=ROOT, **small.environment)
 
 
 @pytest.fixture(scope="session")

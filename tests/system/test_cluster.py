@@ -12,8 +12,9 @@ import pytest
 
 from rtcd_jax.cli.exits import Exit
 from tests.paths import ROOT
+from tests.run.small import Small
 from tests.run.test_folder import driver, end, results
-from tests.run.test_optimize import Small, contents
+from tests.run.test_optimize import contents
 
 SLOWLY = 0.5
 """Seconds of a generation: a signal to one process takes some time to reach all."""

@@ -27,6 +27,19 @@ def test_a_line_reaches_the_file_at_once(tmp_path):
         assert path.read_text() == "half\n"
 
 
+def test_what_others_wrote_is_shown_and_not_obeyed():
+    screen = Screen()
+    outside = "\x1b[31mred\x1b]0;title\x07\x9b2J\r\u202e"
+    with screen.console as console:
+        console.message(f"{outside}\nsecond line")
+        console.progress(Progress(1, 2, outside))
+    shown = r"\x1b[31mred\x1b]0;title\x07\x9b2J\r\u202e"
+    assert f"{shown}\nsecond line\n" in screen.text
+    assert screen.text.count(shown) >= 2
+    assert not set("\x07\x9b\u202e") & set(screen.text)
+    assert "\x1b[31m" not in screen.text
+
+
 def test_one_live_line_on_a_terminal():
     screen = Screen()
     with screen.console as console:
