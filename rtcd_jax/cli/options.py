@@ -153,4 +153,6 @@ def _at_its_option(model: type[Options], problem: Problem) -> Problem:
         return Problem((str(problem.value),), problem.text)
     if inner:  # one of several values
         return Problem((f"--{name} {problem.value}",), problem.text)
+    if isinstance(problem.value, str):  # as it was typed, without quotes
+        return Problem((f"--{name} = {problem.value}",), problem.text)
     return problem._replace(path=(f"--{name}",))

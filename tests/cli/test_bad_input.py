@@ -150,7 +150,7 @@ OTHERS = {
     "no sweep section": (["sweep", RTCD], "has no sweep section"),
     "a damaged case": (["sweep", SWEEP, "--list", "--folder", "swept"], "cannot read swept/000_objective=sum_seed=0"),
     "a file for a study": (["scale", RTCD, "--folder", "measured.csv"], "cannot write measured.csv: File exists"),
-    "no number": (["scale", RTCD, "--populations", "many"], "--populations = 'many': must be whole numbers"),
+    "no number": (["scale", RTCD, "--populations", "many"], "--populations = many: must be whole numbers"),
     "no page": (["report", "run", "--to", "run"], "--to = run: must be a file, and this is a folder"),
     "no place for a page": (
         ["report", "run", "--to", "measured.csv/page.html"],

@@ -217,7 +217,7 @@ ALL_WRONG = {
     "scale": (
         [RTCD, "--populations", "3,64", "--devices", "0", "--repeats", "0"],
         [
-            "--populations = '3,64': all must be >= 4", "--devices = '0': all must be >= 1",
+            "--populations = 3,64: all must be >= 4", "--devices = 0: all must be >= 1",
             "--repeats = 0: must be >= 1",
         ],
     ),

@@ -116,7 +116,7 @@ def test_a_sweep_goes_on_after_a_case_that_fails(searched, small, tmp_path):
     arguments = ["sweep", "sweep.yaml", "--folder", "swept"]
     code, screen = in_terminal(*arguments, folder=tmp_path, width=300, **small.environment)
     ends_well(code, screen, draws=False, expected=Exit.WRONG_INPUT)
-    assert re.search(r"case 0 ended early: .*search\.seed", screen)
+    assert re.search(r"case 0 ended early: .*holds a run with another configuration", screen)
     assert "1 of the cases ended early, see above: 000_seed=1" in screen
     assert "the run is finished, but its report failed: " in screen
     assert f"`rtcd report swept/{case}` makes it" in screen
