@@ -243,7 +243,7 @@ def test_wrong_funnel_files_are_refused(tmp_path, change, reason):
         (["m=1e300"], "--parameters m=1e+300: must be"),
         ([*["b=0", "--r", "nan"]], "--r = nan"),
         ([*["b=0", "--r", "inf"]], "--r = inf"),
-        ([*["b=0", "--q", "inf", "1"]], "--q = inf 1.0: must be 2 numbers"),
+        ([*["b=0", "--q", "inf", "1"]], "--q inf: must be finite"),
         ([*["b=0", "--state_limits", "nan", "1"]], "--state_limits = nan 1.0: must be 2 numbers"),
     ],
 )
