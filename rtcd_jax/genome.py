@@ -1,6 +1,6 @@
 """Genome [d] in the unit box <-> Candidate: boxes, scaling, pinned variables.
 
-Designs and the policy's discount are scaled linearly, weights and the policy's authority logarithmically; pinned
+Designs are scaled linearly, weights logarithmically, the policy's options as the configuration's schema says; pinned
 variables have no dimension.
 """
 
@@ -32,8 +32,7 @@ def decode(problem: Problem, genome: Float[Array, " d"]) -> Candidate:
         design=problem.plant.Design(*section("design.")),
         q=jnp.stack(section("weights.q.")),
         r=jnp.stack(section("weights.r.")),
-        authority=values.get("policy.authority"),
-        discount=values.get("policy.discount"),
+        policy={name.removeprefix("policy."): value for name, value in values.items() if name.startswith("policy.")},
     )
 
 

@@ -105,8 +105,7 @@ def goal_value(problem: Problem, candidate: Candidate):
 
 def options(problem: Problem, candidate: Candidate) -> dict[str, Any]:
     """The policy's options by name: the candidate's, or else the configuration's."""
-    chosen = {"authority": candidate.authority, "discount": candidate.discount}
-    return problem.config.policy.initial() | {name: value for name, value in chosen.items() if value is not None}
+    return problem.config.policy.initial() | candidate.policy
 
 
 def input_weights(problem: Problem, candidate: Candidate, us):

@@ -101,7 +101,7 @@ def _variables(config: Config):
             low=variable.min,
             high=variable.max,
             free=variable.free,
-            logarithmic=key.startswith("weights.") or key == "policy.authority",
+            logarithmic=config.logarithmic(key),
         )
 
 

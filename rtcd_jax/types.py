@@ -5,6 +5,7 @@ binds `N` at the first annotation and can evaluate `N+1` only afterwards.
 """
 
 import enum
+from dataclasses import dataclass
 
 import equinox as eqx
 import jax
@@ -45,14 +46,13 @@ def first_failure(*statuses: Int[Array, ""]) -> Int[Array, ""]:
 
 class Candidate(eqx.Module):
     """What the search chooses: the robot's design, the diagonals of the cost weights Q and R, and what it is asked to
-    choose of the policy's options; None is the configuration's number.
+    choose of the policy's options, by name; the others are the configuration's numbers.
     """
 
     design: eqx.Module
     q: Float[Array, " n"]
     r: Float[Array, " m"]
-    authority: Float[Array, ""] | None = None
-    discount: Float[Array, ""] | None = None
+    policy: dict[str, Float[Array, ""]] = eqx.field(default_factory=dict)
 
 
 class Trajectory(eqx.Module):
@@ -92,18 +92,34 @@ class Funnel(eqx.Module):
     status: Int[Array, ""]
 
 
-class Volumes(eqx.Module):
-    """Exact ellipsoid volumes of a funnel, in the product of the states' units.
-
-    `total` is the sum over the knots (the paper's objective), `integral` that over time [.. s],
-    `inlet` the first ellipsoid's, `geometric_mean` the one that an empty knot brings to zero.
+@jax.tree_util.register_pytree_with_keys_class
+@dataclass(frozen=True)
+class Volumes:
+    """Exact ellipsoid volumes of a funnel, in the product of the states' units; `volumes["sum"]` and so on are made of
+    those of the knots as `VOLUMES` in volume.py says.
     """
 
     per_knot: Float[Array, " N+1"]
-    total: Float[Array, ""]
-    integral: Float[Array, ""]
-    inlet: Float[Array, ""]
-    geometric_mean: Float[Array, ""]
+    named: dict[str, Float[Array, ""]]
+
+    def __getitem__(self, name: str) -> Float[Array, ""]:
+        if name not in self.named:
+            raise KeyError(f"no volume is called {name!r}; there are {', '.join(self.named)}")
+        return self.named[name]
+
+    def tree_flatten_with_keys(self):
+        names = ("per_knot", *(_STORED.get(name, name) for name in self.named))
+        leaves = (self.per_knot, *self.named.values())
+        return [(jax.tree_util.GetAttrKey(n), leaf) for n, leaf in zip(names, leaves, strict=True)], tuple(self.named)
+
+    @classmethod
+    def tree_unflatten(cls, names: tuple[str, ...], leaves) -> "Volumes":
+        per_knot, *others = leaves
+        return cls(per_knot, dict(zip(names, others, strict=True)))
+
+
+_STORED = {"sum": "total"}
+"""What checkpoints call a volume, where that is not its name."""
 
 
 class Evaluation(eqx.Module):

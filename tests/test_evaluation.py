@@ -54,8 +54,8 @@ def test_the_same_key_gives_the_same_result_and_another_one_other_samples():
     assert same(again, pipeline.evaluated())
     assert same(other.funnel.policy, again.funnel.policy)
     fine = np.asarray(again.status) == Status.OK
-    assert not np.any(np.asarray(other.volumes.total == again.volumes.total)[fine])
-    np.testing.assert_allclose(other.volumes.total[fine], again.volumes.total[fine], rtol=0.03)
+    assert not np.any(np.asarray(other.volumes["sum"] == again.volumes["sum"])[fine])
+    np.testing.assert_allclose(other.volumes["sum"][fine], again.volumes["sum"][fine], rtol=0.03)
 
 
 def test_neighbors_do_not_matter():
@@ -67,7 +67,7 @@ def test_neighbors_do_not_matter():
     others = np.array([0, 1, 3, 4])
     assert same(*(jax.tree.map(lambda leaf: leaf[others], e) for e in (broken, pipeline.evaluated())))
     assert broken.status[2] == Status.TRAJECTORY_NOT_SOLVED
-    assert broken.volumes.total[2] == 0
+    assert broken.volumes["sum"][2] == 0
 
 
 @pytest.mark.slow

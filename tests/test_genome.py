@@ -87,16 +87,14 @@ def test_options_of_the_policy_are_dimensions_behind_the_weights(optional):
     assert names[-2:] == ["policy.authority", "policy.discount"]
     assert optional.design_dims == (True, True, *[False] * 5)
     middle = decode(optional, jnp.full(7, 0.5))
-    assert float(middle.authority) == pytest.approx(0.2)
-    assert float(middle.discount) == pytest.approx(1)
+    assert float(middle.policy["authority"]) == pytest.approx(0.2)
+    assert float(middle.policy["discount"]) == pytest.approx(1)
     initial = decode(optional, jnp.asarray(initial_genome(optional)))
-    assert (float(initial.authority), float(initial.discount)) == pytest.approx((0.1, 0.5))
+    assert (float(initial.policy["authority"]), float(initial.policy["discount"])) == pytest.approx((0.1, 0.5))
 
 
 def test_fixed_options_are_the_configuration_s(problem):
-    candidate = decode(problem, jnp.zeros(5))
-    assert candidate.authority is None
-    assert candidate.discount is None
+    assert decode(problem, jnp.zeros(5)).policy == {}
 
 
 def test_outside_the_unit_box_is_outside_the_box(problem):

@@ -261,13 +261,13 @@ def test_a_candidate_s_own_options_go_before_the_configuration_s(problem, cautio
     soft, trajectory = take(candidates, SOFT), take(planned, SOFT)
     weighed = problem.config.policy.model_copy(update={"input_weight": 0.3})
     searched = dataclasses.replace(problem, config=problem.config.model_copy(update={"policy": weighed}))
-    chosen = dataclasses.replace(soft, authority=jnp.asarray(0.2), discount=jnp.asarray(0.7))
+    chosen = dataclasses.replace(soft, policy={"authority": jnp.asarray(0.2), "discount": jnp.asarray(0.7)})
     fixed = jax.jit(partial(stabilize, cautious))(soft, trajectory)
     found = jax.jit(partial(stabilize, searched))(chosen, trajectory)
     np.testing.assert_allclose(found.values, fixed.values, rtol=1e-12)
     np.testing.assert_allclose(found.gains, fixed.gains, rtol=1e-12)
     assert options(searched, chosen) == pytest.approx(OPTIONS)
-    other = dataclasses.replace(chosen, discount=jnp.asarray(0.0))
+    other = dataclasses.replace(chosen, policy=chosen.policy | {"discount": jnp.asarray(0.0)})
     assert not np.allclose(jax.jit(partial(stabilize, searched))(other, trajectory).gains, fixed.gains, rtol=1e-2)
 
 

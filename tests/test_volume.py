@@ -3,12 +3,13 @@
 from math import gamma, pi
 from pathlib import Path
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from rtcd_jax.types import Funnel, Policy, Status, Trajectory
-from rtcd_jax.volume import funnel_volume
+from rtcd_jax.volume import VOLUMES, funnel_volume
 
 PUBLISHED = Path(__file__).parents[2] / "shared" / "reference"
 DT = 0.07
@@ -43,7 +44,7 @@ def test_one_two_and_four_dimensions_by_their_own_formulas():
     for n, unit in ((1, 2.0), (2, pi), (4, pi**2 / 2)):
         semi = axes[:n] * np.sqrt(rho)
         value = np.tile(np.diag(1 / axes[:n] ** 2), (2, 1, 1))
-        np.testing.assert_allclose(funnel_volume(_funnel(value, [rho, rho])).inlet, unit * semi.prod(), rtol=1e-13)
+        np.testing.assert_allclose(funnel_volume(_funnel(value, [rho, rho]))["inlet"], unit * semi.prod(), rtol=1e-13)
 
 
 @pytest.mark.parametrize("n", [2, 4])
@@ -61,19 +62,19 @@ def test_a_linear_map_scales_volumes_by_its_determinant(n):
 def test_the_four_volumes_follow_from_the_knots(n):
     volumes = funnel_volume(_random_funnel(n))
     knots = np.asarray(volumes.per_knot)
-    np.testing.assert_allclose(volumes.total, knots.sum(), rtol=1e-14)
-    np.testing.assert_allclose(volumes.integral, np.trapezoid(knots, dx=DT), rtol=1e-14)
-    np.testing.assert_allclose(volumes.geometric_mean, knots.prod() ** (1 / len(knots)), rtol=1e-13)
-    assert volumes.inlet == knots[0]
-    assert volumes.geometric_mean < volumes.total / len(knots)
+    np.testing.assert_allclose(volumes["sum"], knots.sum(), rtol=1e-14)
+    np.testing.assert_allclose(volumes["integral"], np.trapezoid(knots, dx=DT), rtol=1e-14)
+    np.testing.assert_allclose(volumes["geometric_mean"], knots.prod() ** (1 / len(knots)), rtol=1e-13)
+    assert volumes["inlet"] == knots[0]
+    assert volumes["geometric_mean"] < volumes["sum"] / len(knots)
 
 
 def test_an_empty_knot_leaves_the_sum_and_kills_the_geometric_mean():
     whole = _random_funnel(2)
     levels = whole.levels.at[3].set(0.0)
     volumes, before = funnel_volume(_funnel(whole.policy.values, levels)), funnel_volume(whole)
-    np.testing.assert_allclose(volumes.total, before.total - before.per_knot[3], rtol=1e-13)
-    assert volumes.geometric_mean == 0
+    np.testing.assert_allclose(volumes["sum"], before["sum"] - before.per_knot[3], rtol=1e-13)
+    assert volumes["geometric_mean"] == 0
 
 
 @pytest.mark.parametrize("status", [status for status in Status if status != Status.OK])
@@ -82,7 +83,7 @@ def test_a_failed_candidate_has_no_volume(status):
     funnel = _random_funnel(2, status=status)
     broken = _funnel(funnel.policy.values.at[2].set(jnp.nan), funnel.levels.at[4].set(-1.0), status)
     for volumes in (funnel_volume(funnel), funnel_volume(broken)):
-        for volume in (*volumes.per_knot, volumes.total, volumes.integral, volumes.inlet, volumes.geometric_mean):
+        for volume in (*volumes.per_knot, *volumes.named.values()):
             assert volume == 0
 
 
@@ -94,4 +95,13 @@ def test_the_published_initial_funnels_have_their_published_sums(name, n, publis
     values = np.zeros((len(rows), n, n))
     for i, j in zip(*np.triu_indices(n), strict=True):
         values[:, i, j] = values[:, j, i] = rows[f"S{i + 1}{j + 1}"]
-    assert float(funnel_volume(_funnel(values, rows["rho"])).total) == pytest.approx(published, abs=0.051)
+    assert float(funnel_volume(_funnel(values, rows["rho"]))["sum"]) == pytest.approx(published, abs=0.051)
+
+
+def test_a_population_s_volumes_keep_their_order_and_the_checkpoints_names():
+    """Orbax finds a leaf by its path: `total` is what checkpoints have called the sum from the first one on."""
+    funnels = _funnel(jnp.stack([jnp.eye(2)] * 3), jnp.arange(1.0, 4.0))
+    batch = jax.jit(jax.vmap(funnel_volume))(jax.tree.map(lambda leaf: jnp.stack([leaf, leaf]), funnels))
+    assert list(batch.named) == list(VOLUMES)
+    paths = [jax.tree_util.keystr(path) for path, _ in jax.tree_util.tree_flatten_with_path(batch)[0]]
+    assert paths == [".per_knot", ".total", ".integral", ".inlet", ".geometric_mean"]

@@ -34,7 +34,6 @@ CANDIDATES["off_the_rail"] = CANDIDATES["cartpole"] | {
 }
 FAR = 2.0
 """[m]: the funnels' own extent along the rail."""
-VOLUMES = {"sum": "total", "integral": "integral", "inlet": "inlet", "geometric mean": "geometric_mean"}
 
 
 def main() -> None:
@@ -46,6 +45,7 @@ def main() -> None:
     from rtcd_jax.evaluation import elite_budget, elite_key, make_evaluate
     from rtcd_jax.genome import encode
     from rtcd_jax.problem import make_problem
+    from rtcd_jax.volume import VOLUMES
 
     config = off_the_rail(load(_config("cartpole"))) if robot == "off_the_rail" else load(_config(robot))
     problem = make_problem(config)
@@ -55,10 +55,10 @@ def main() -> None:
         genome = jnp.asarray(encode(problem, values))
         found[name] = jax.tree.map(lambda leaf: leaf[0], evaluate(genome[None], elite_key()))
     print(f"{'volume (sampled)':16}" + "".join(f"{name:>24}" for name in found))
-    for label, field in VOLUMES.items():
-        values = [float(getattr(evaluation.volumes, field)) for evaluation in found.values()]
-        print(f"{label:16}" + "".join(f"{value:14.5g} x{value / values[0]:8.2f}" for value in values))
-    shares = [float(evaluation.volumes.per_knot.max() / evaluation.volumes.total) for evaluation in found.values()]
+    for name in VOLUMES:
+        values = [float(evaluation.volumes[name]) for evaluation in found.values()]
+        print(f"{name:16}" + "".join(f"{value:14.5g} x{value / values[0]:8.2f}" for value in values))
+    shares = [float(evaluation.volumes.per_knot.max() / evaluation.volumes["sum"]) for evaluation in found.values()]
     print(f"{'largest knot':16}" + "".join(f"{share:24.1%}" for share in shares))
 
 

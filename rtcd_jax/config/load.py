@@ -82,6 +82,11 @@ class Config(Settings):
             found |= {f"weights.{letter}.{i}": variable for i, variable in enumerate(variables)}
         return found | {f"policy.{name}": variable for name, variable in self.policy.variables().items()}
 
+    def logarithmic(self, key: str) -> bool:
+        """Whether the search scales the variable of this dotted key logarithmically."""
+        section, _, name = key.partition(".")
+        return section == "weights" or (section == "policy" and self.policy.logarithmic(name))
+
 
 def _sizes(plant: PlantConfig, task: TaskConfig) -> Iterator[Problem]:
     for key, value in task:

@@ -6,13 +6,14 @@
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from math import inf
-from typing import Annotated, Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 from pydantic import Field, GetCoreSchemaHandler, SerializeAsAny
 from pydantic_core.core_schema import CoreSchema, no_info_plain_validator_function
 
 from rtcd_jax.config.settings import Settings, invalid
 from rtcd_jax.system.errors import Problem, closest
+from rtcd_jax.volume import VOLUMES
 
 UNIT = "its unit"
 """Stands in a description for the unit that the plant gives."""
@@ -205,6 +206,10 @@ class PolicyConfig(Settings):
         """Those of the options that are variables."""
         return {name: option for name, option in self if isinstance(option, Variable)}
 
+    def logarithmic(self, name: str) -> bool:
+        """Whether this option is searched on a log scale."""
+        return any(getattr(item, "logarithmic", False) for item in type(self).model_fields[name].metadata)
+
     def initial(self) -> dict[str, float]:
         """The options' numbers, a variable's initial one."""
         return {name: option.initial if isinstance(option, Variable) else option for name, option in self}
@@ -274,10 +279,14 @@ SMALLEST_POPULATION = 4
 """CMA-ES needs two parents, the better half of its population."""
 
 
+if TYPE_CHECKING:
+    Objective = str
+else:
+    Objective = Literal[tuple(VOLUMES)]
+
+
 class SearchConfig(Settings):
-    objective: Literal["sum", "integral", "inlet", "geometric_mean"] = Field(
-        default="sum", description="volume to maximize"
-    )
+    objective: Objective = Field(default="sum", description="volume to maximize")
     mode: Literal["joint", "nested"] = Field(
         default="joint", description="one search over all, or weights inside designs"
     )

@@ -1,10 +1,9 @@
 """Robots by name. A new one is a file, an MJCF beside it, and a line here."""
 
-import difflib
-
 from rtcd_jax.plants.base import Plant
 from rtcd_jax.plants.cartpole import Cartpole
 from rtcd_jax.plants.pendulum import Pendulum
+from rtcd_jax.system.errors import closest
 
 PLANTS: dict[str, type[Plant]] = {"pendulum": Pendulum, "cartpole": Cartpole}
 
@@ -15,8 +14,6 @@ def plant_class(name: str) -> type[Plant]:
     Raises:
         ValueError: no robot has this name.
     """
-    if name in PLANTS:
-        return PLANTS[name]
-    close = difflib.get_close_matches(name, PLANTS, n=1)
-    hint = f"; did you mean {close[0]!r}?" if close else ""
-    raise ValueError(f"no plant is called {name!r}; there are {', '.join(sorted(PLANTS))}{hint}")
+    if name not in PLANTS:
+        raise ValueError(f"no plant is called {name!r}; {closest(name, tuple(PLANTS))}")
+    return PLANTS[name]

@@ -11,9 +11,9 @@ from rtcd_jax.evaluation import elite_budget
 from rtcd_jax.numerics.proportion import failure_bound
 from rtcd_jax.policy import options
 from rtcd_jax.problem import Problem
-from rtcd_jax.search.archive import OBJECTIVES, volume
 from rtcd_jax.types import Evaluation, Status
 from rtcd_jax.validation import PhysicsComparison
+from rtcd_jax.volume import VOLUMES
 
 
 def arrays_of(problem: Problem, evaluation: Evaluation) -> dict[str, np.ndarray]:
@@ -35,10 +35,7 @@ def arrays_of(problem: Problem, evaluation: Evaluation) -> dict[str, np.ndarray]
         "x_goal": problem.goal,
         "u_max": problem.input_limits,
         "volumes_per_knot": volumes.per_knot,
-        "volumes_sum": volumes.total,
-        "volumes_integral": volumes.integral,
-        "volumes_inlet": volumes.inlet,
-        "volumes_geometric_mean": volumes.geometric_mean,
+        **{f"volumes_{name}": volumes[name] for name in VOLUMES},
         "genome": host.genome,
     }
 
@@ -78,8 +75,8 @@ def record_of(
         "confidence": config.funnel.confidence,
         "samples": int(funnel.trials.min()),
         "volumes": {
-            **{name: volume(volumes, name) for name in OBJECTIVES},
-            "share_of_largest_knot": float(volumes.per_knot.max() / max(volumes.total, np.finfo(float).tiny)),
+            **{name: volumes[name] for name in VOLUMES},
+            "share_of_largest_knot": float(volumes.per_knot.max() / max(volumes["sum"], np.finfo(float).tiny)),
         },
         "duration": float(funnel.policy.trajectory.dt * problem.intervals),
         "trajectory": {
@@ -108,7 +105,7 @@ def epsilon(samples: np.ndarray, confidence: float, statements: int) -> float:
 
 def _spread(evaluations: Sequence[Evaluation]) -> dict[str, Any]:
     """Standard deviation over mean of every volume, over evaluations that differ in their random numbers alone."""
-    volumes = {name: [float(volume(e.volumes, name)) for e in evaluations] for name in OBJECTIVES}
+    volumes = {name: [float(e.volumes[name]) for e in evaluations] for name in VOLUMES}
     relative = {
         name: np.std(found, ddof=1) / np.mean(found) if np.mean(found) else None for name, found in volumes.items()
     }

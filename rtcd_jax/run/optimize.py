@@ -18,11 +18,12 @@ from rtcd_jax.run.format import arrays_of, record_of
 from rtcd_jax.run.reevaluation import Reevaluation, Reported, physics_line, row
 from rtcd_jax.run.sharding import Spread, spread
 from rtcd_jax.search import search
-from rtcd_jax.search.archive import OBJECTIVES, Elites
+from rtcd_jax.search.archive import Elites
 from rtcd_jax.system.cluster import Cluster, Preempted
 from rtcd_jax.system.console import Clock, Console, Progress, times
 from rtcd_jax.system.errors import UserError
 from rtcd_jax.types import Evaluation, Status
+from rtcd_jax.volume import VOLUMES
 
 LAST_FILE = Path("initial.json")
 """Written when all else is: a folder that has it is complete."""
@@ -155,7 +156,7 @@ def _summary(problem: Problem, initial: Reported, best: Reported) -> Iterator[st
     """The volumes of the initial and the best candidate with their spreads and ratios, and what the best one is."""
     before, after = record_of(problem, *initial), record_of(problem, *best)
     yield f"{'volume (sampled)':18}{'initial':>12}{'spread':>9}{'best':>12}{'spread':>9}{'ratio':>9}"
-    for name in OBJECTIVES:
+    for name in VOLUMES:
         cells = [f"{name:18}"]
         for record in (before, after):
             spread = record["spread"]["volumes"][name] if record["spread"] else None
@@ -171,7 +172,6 @@ def _summary(problem: Problem, initial: Reported, best: Reported) -> Iterator[st
         f"{name} {after['design'][name]:.4g} {unit}" for name, unit in problem.plant.design_units.items()
     )
     weights = ", ".join(f"{value:.4g}" for value in (*after["weights"]["q"], *after["weights"]["r"]))
-    chosen = best.evaluation.candidate
-    options = {"authority": chosen.authority, "discount": chosen.discount}
-    searched = "".join(f"; {name} {float(value):.4g}" for name, value in options.items() if value is not None)
+    options = best.evaluation.candidate.policy
+    searched = "".join(f"; {name} {float(value):.4g}" for name, value in options.items())
     yield f"best: {design}; diagonals of Q and R: {weights}{searched}"

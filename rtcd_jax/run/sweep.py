@@ -26,11 +26,11 @@ from rtcd_jax.config.load import Config, parse, read_yaml
 from rtcd_jax.system.console import table
 from rtcd_jax.system.errors import ConfigError, Problem, UserError, closest
 from rtcd_jax.system.files import make_folder, read_json, reading, replace
+from rtcd_jax.volume import VOLUMES
 
 TABLE = "table.csv"
 WAYS = ("product", "zip")
 MOST_CASES = 10_000
-VOLUMES = ("sum", "integral", "inlet", "geometric_mean")
 
 
 @final
@@ -136,7 +136,7 @@ def show(cases: Sequence[Case]) -> str:
 
 
 def store(cases: Sequence[Case], folder: Path) -> Path:
-    """All four volumes of each case as `table.csv` in the folder; the file."""
+    """All volumes of each case as `table.csv` in the folder; the file."""
     rows = [_row(case) for case in cases]
     text = io.StringIO()
     writer = csv.DictWriter(text, list(rows[0]), lineterminator="\n")

@@ -11,8 +11,6 @@ from jaxtyping import Array, Float, Int
 
 from rtcd_jax.types import Evaluation, Status, Volumes
 
-OBJECTIVES = {"sum": "total", "integral": "integral", "inlet": "inlet", "geometric_mean": "geometric_mean"}
-
 
 class Evaluated(Protocol):
     """A population's evaluation, wherever its records are: an Evaluation, or one that is spread over devices."""
@@ -45,19 +43,12 @@ class Elites(eqx.Module):
         return jnp.sum(jnp.isfinite(self.costs))
 
 
-def volume(volumes: Volumes, objective: str) -> Float[Array, "*P"]:
-    """The volume that `objective` names. Raises ValueError for a name that is none of `OBJECTIVES`."""
-    if objective not in OBJECTIVES:
-        raise ValueError(f"objective {objective!r} is none of {', '.join(OBJECTIVES)}")
-    return getattr(volumes, OBJECTIVES[objective])
-
-
 def cost(evaluation: Evaluated, objective: str) -> Float[Array, "*P"]:
     """-log(volume), to be minimized, in float64; +inf for a candidate that has failed.
 
     The logarithm keeps the order, and makes the penalty at the box independent of the volume's unit.
     """
-    value = jnp.asarray(volume(evaluation.volumes, objective), jnp.float64)
+    value = jnp.asarray(evaluation.volumes[objective], jnp.float64)
     feasible = (evaluation.status == Status.OK) & jnp.isfinite(value) & (value > 0)
     return jnp.where(feasible, -jnp.log(jnp.where(feasible, value, 1.0)), jnp.inf)
 

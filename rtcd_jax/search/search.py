@@ -212,7 +212,7 @@ class _Seen(NamedTuple):
 
     @classmethod
     def of(cls, evaluation: Evaluated, objective: str) -> Self:
-        volumes = {name: elites.volume(evaluation.volumes, name) for name in elites.OBJECTIVES}
+        volumes = evaluation.volumes.named
         costs = elites.cost(evaluation, objective)
         seen = jax.device_get(cls(evaluation.genome, evaluation.status, costs, volumes))
         feasible = np.isfinite(seen.costs)
@@ -242,4 +242,4 @@ def _record(plan: Plan, after: SearchState, seen: _Seen, stops: np.ndarray) -> G
 
 
 def _best_so_far(found: Elites, objective: str) -> float:
-    return float(elites.volume(found.evaluation.volumes, objective)[0]) if int(found.count) else float("nan")
+    return float(found.evaluation.volumes[objective][0]) if int(found.count) else float("nan")

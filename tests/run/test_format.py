@@ -37,7 +37,7 @@ def record():
 def test_the_policy_of_the_record_is_the_candidate_s():
     """Where the search chose it; else the configuration's, as everywhere in this box."""
     evaluation, fixed = _row(pipeline.RTCD), {"input_weight": 1.0, "authority": 1.0, "discount": 0.0}
-    chosen = dataclasses.replace(evaluation.candidate, authority=np.float64(0.25))
+    chosen = dataclasses.replace(evaluation.candidate, policy={"authority": np.float64(0.25)})
     assert record_of(pipeline.problem(), evaluation)["policy"] == fixed
     searched = dataclasses.replace(evaluation, candidate=chosen)
     assert plain(record_of(pipeline.problem(), searched)["policy"]) == {**fixed, "authority": 0.25}
@@ -164,7 +164,9 @@ def test_the_spread_is_that_over_the_keys():
     evaluation = _row(pipeline.RTCD)
     volumes = evaluation.volumes
     others = [
-        dataclasses.replace(evaluation, volumes=dataclasses.replace(volumes, total=factor * volumes.total))
+        dataclasses.replace(
+            evaluation, volumes=dataclasses.replace(volumes, named=volumes.named | {"sum": factor * volumes["sum"]})
+        )
         for factor in (0.99, 1.0, 1.01)
     ]
     spread = plain(record_of(pipeline.problem(), evaluation, others))["spread"]
@@ -183,6 +185,6 @@ def test_the_summary_has_a_dash_where_a_number_is_none():
     hard, best = _row(pipeline.HARD), _row(pipeline.RTCD)
     initial, first = Reported(hard, [hard, hard], None), Reported(best, [best, best], None)
     lines = list(_summary(pipeline.problem(), initial, first))
-    total = float(best.volumes.total)
+    total = float(best.volumes["sum"])
     assert lines[1].split() == ["sum", "0", "-", f"{total:.5g}", "0.0%", "-"]
     assert "the initial candidate has no funnel" in lines[5]

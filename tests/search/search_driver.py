@@ -44,7 +44,7 @@ def results(found):
     for k in range(int(found.count)):
         evaluation = jax.tree.map(lambda leaf, k=k: np.asarray(leaf[k]), found.evaluation)
         arrays = {"genome": evaluation.genome, "rho": evaluation.funnel.levels}
-        yield arrays, {"volume": evaluation.volumes.total, "generation": found.generations[k]}
+        yield arrays, {"volume": evaluation.volumes["sum"], "generation": found.generations[k]}
 
 
 def drive(path, config, seconds=0.0, cluster=None):

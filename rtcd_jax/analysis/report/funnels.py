@@ -10,8 +10,9 @@ from jaxtyping import Float
 from rtcd_jax.analysis.report.canvas import BLACK, GRAY, LIGHT, SMALL, WIDTH, blank, written
 from rtcd_jax.analysis.report.reading import FunnelView, Run, funnel_views
 from rtcd_jax.analysis.report.shapes import outlines, planes, projections
-from rtcd_jax.analysis.report.words import VOLUMES, guarantee, listed, quantity, volume_unit, words
+from rtcd_jax.analysis.report.words import guarantee, listed, quantity, volume_unit, words
 from rtcd_jax.config.load import Config
+from rtcd_jax.volume import VOLUMES
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -9,14 +9,15 @@ import numpy as np
 from jaxtyping import Float
 
 from rtcd_jax.analysis.report.words import letter, words
+from rtcd_jax.config import settings
 from rtcd_jax.config.load import Config
-from rtcd_jax.config.schema import Variable
+from rtcd_jax.config.schema import PolicyConfig, Variable
 
 Generations = Sequence[Mapping[str, Any]]
 QUANTILES = (10, 90)
 """Percentiles between which a population's spread is drawn."""
-POLICY = {"authority": "authority [-]", "discount": "discount [1/s]"}
-"""What the policy's searched options are called."""
+OPTIONS = {name: f"{words(name)} [{settings.unit(field)}]" for name, field in PolicyConfig.model_fields.items()}
+"""What the policy's options are called."""
 
 
 def column(generations: Generations, name: str) -> Float[np.ndarray, " generations"]:
@@ -49,18 +50,13 @@ def searched(config: Config) -> dict[str, tuple[Variable, str]]:
     for sign, named in (("q", plant.states), ("r", plant.inputs)):
         for i, (name, unit) in enumerate(named.items()):
             titles[f"weights.{sign}.{i}"] = f"{sign}{i + 1} of {letter(name)} [1/(s {_squared(unit)})]"
-    titles |= {f"policy.{name}": title for name, title in POLICY.items()}
+    titles |= {f"policy.{name}": title for name, title in OPTIONS.items()}
     return {name: (variable, titles[name]) for name, variable in config.variables().items() if variable.free}
 
 
-def logarithmic(name: str) -> bool:
-    """Whether the search scales a variable logarithmically."""
-    return name.startswith("weights.") or name == "policy.authority"
-
-
-def physical(name: str, variable: Variable, shares: np.ndarray) -> np.ndarray:
+def physical(variable: Variable, logarithmic: bool, shares: np.ndarray) -> np.ndarray:
     """The values that shares of a variable's box stand for, linearly or logarithmically."""
-    if logarithmic(name):
+    if logarithmic:
         return variable.min * np.exp(shares * log(variable.max / variable.min))
     return variable.min + shares * (variable.max - variable.min)
 
@@ -73,19 +69,16 @@ class Course:
     name: str
     title: str
     variable: Variable
+    logarithmic: bool
     best: Float[np.ndarray, " generations"]
     low: Float[np.ndarray, " generations"]
     median: Float[np.ndarray, " generations"]
     high: Float[np.ndarray, " generations"]
 
     @property
-    def logarithmic(self) -> bool:
-        return logarithmic(self.name)
-
-    @property
     def window(self) -> tuple[float, float]:
         """The variable's box with a margin, on its own scale."""
-        low, high = (physical(self.name, self.variable, np.array(share)) for share in (-0.05, 1.05))
+        low, high = (physical(self.variable, self.logarithmic, np.array(share)) for share in (-0.05, 1.05))
         return float(low), float(high)
 
 
@@ -99,8 +92,9 @@ def courses(config: Config, generations: Generations) -> list[Course]:
             best[index] = genomes[index, volumes.argmax()]
     quantiles = np.percentile(genomes, (QUANTILES[0], 50, QUANTILES[1]), axis=1)
     return [
-        Course(name, title, variable, *(physical(name, variable, share[:, i]) for share in (best, *quantiles)))
+        Course(name, title, variable, log_scale, *(physical(variable, log_scale, s[:, i]) for s in (best, *quantiles)))
         for i, (name, (variable, title)) in enumerate(searched(config).items())
+        for log_scale in [config.logarithmic(name)]
     ]
 
 

@@ -9,7 +9,6 @@ from typing import Any, final
 
 import numpy as np
 
-from rtcd_jax.analysis.report.words import VOLUMES
 from rtcd_jax.certificate.standing import certificate_path, standing
 from rtcd_jax.config.load import Config
 from rtcd_jax.elite.elite import Elite, initial_and_best
@@ -24,6 +23,7 @@ from rtcd_jax.elite.records import (
 from rtcd_jax.system.console import Console, Progress, silent
 from rtcd_jax.system.errors import UserError
 from rtcd_jax.system.files import read_json, reading
+from rtcd_jax.volume import VOLUMES
 
 # Okabe and Ito's colors: distinct in all kinds of color vision.
 BLUE, VERMILION = "#0072B2", "#D55E00"

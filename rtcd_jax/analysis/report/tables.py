@@ -5,9 +5,10 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, final
 
-from rtcd_jax.analysis.report.history import POLICY
+from rtcd_jax.analysis.report.history import OPTIONS
 from rtcd_jax.analysis.report.reading import Experiment, Run
-from rtcd_jax.analysis.report.words import VOLUMES, duration, ratio, volume_unit, words
+from rtcd_jax.analysis.report.words import duration, ratio, volume_unit, words
+from rtcd_jax.volume import VOLUMES
 
 Cell = str | float | int | None
 
@@ -38,7 +39,7 @@ def comparison(runs: Sequence[Run]) -> Table:
     plant = runs[0].config.plant
     heads = (
         "run", "searched", *(f"{words(name)} [{unit}]" for name, unit in plant.design.items()),
-        *_weight_heads(runs[0]), *(POLICY[name] for name in _searched_options(runs)), *map(words, VOLUMES),
+        *_weight_heads(runs[0]), *(OPTIONS[name] for name in _searched_options(runs)), *map(words, VOLUMES),
         "sum × initial", "guarantee", "sum shown", "guarantee shown", "promise",
         "time",
     )  # fmt: skip
@@ -56,7 +57,7 @@ def elites(run: Run) -> Table:
     varied, compared = (any(record.get(key) for record in run.elites.values()) for key in ("spread", "mjx"))
     heads = (
         "elite", *(f"{words(name)} [{unit}]" for name, unit in plant.design.items()), *_weight_heads(run),
-        *(POLICY[name] for name in options),
+        *(OPTIONS[name] for name in options),
         *(f"{words(name)} [{volume_unit(run.config, name)}]" for name in VOLUMES), "sum × initial",
         "largest knot [%]", "swing-up [s]", "ε", "guarantee", *(["spread of sum [%]"] if varied else []),
         *(["MJX − closed form"] if compared else []), *(["sum shown", "guarantee shown"] if shown else []),
@@ -206,7 +207,7 @@ def _origin(run: Run) -> Iterator[tuple[Cell, ...]]:
 
 def _searched_options(runs: Sequence[Run]) -> list[str]:
     """The policy's options that any of the runs searched."""
-    return [name for name in POLICY if any(name in run.config.policy.variables() for run in runs)]
+    return [name for name in OPTIONS if any(name in run.config.policy.variables() for run in runs)]
 
 
 def _weight_heads(run: Run) -> list[str]:

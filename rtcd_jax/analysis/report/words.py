@@ -7,9 +7,8 @@ from typing import Any
 import numpy as np
 
 from rtcd_jax.config.load import Config
+from rtcd_jax.volume import VOLUMES
 
-VOLUMES = ("sum", "integral", "inlet", "geometric_mean")
-"""The volumes of a funnel by their stored names."""
 NONE = "–"
 """Stands where there is no number."""
 
@@ -40,8 +39,8 @@ def quantity(name: str, unit: str) -> str:
 
 
 def volume_unit(config: Config, volume: str = "sum") -> str:
-    """That of a volume, the product of the states' units with equal ones as powers; the integral has a second more."""
-    powers = Counter({"s": 1} if volume == "integral" else {})
+    """That of a volume, the product of the states' units with equal ones as powers; some have a second more."""
+    powers = Counter({"s": VOLUMES[volume].seconds})
     for unit in config.plant.states.values():
         above, _, below = unit.partition("/")
         powers[above] += 1

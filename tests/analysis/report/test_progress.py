@@ -94,10 +94,10 @@ def test_decoded_values_are_those_of_the_search():
         genome = np.linspace(0.1, 0.9, len(variables))
         candidate = decode(make_problem(config), jnp.asarray(genome))
         design = [getattr(candidate.design, name) for name in config.plant.design]
-        policy = [getattr(candidate, name) for name in config.policy.variables()]
+        policy = [candidate.policy[name] for name in config.policy.variables()]
         values = dict(zip(config.variables(), [*design, *candidate.q, *candidate.r, *policy], strict=True))
         for share, (name, (variable, _)) in zip(genome, variables.items(), strict=True):
-            np.testing.assert_allclose(physical(name, variable, share), float(values[name]))
+            np.testing.assert_allclose(physical(variable, config.logarithmic(name), share), float(values[name]))
 
 
 def test_the_spread_is_that_of_the_candidates_with_a_funnel(tmp_path):
