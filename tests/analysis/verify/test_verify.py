@@ -357,7 +357,7 @@ def test_a_goal_that_is_not_held_is_refused():
     [
         ({"rho": np.ones(5)}, r"6 knots, 2 states and 1 inputs cannot have rho \(5,\): must be .*rho \(6,\)"),
         ({"rho": np.array([1, 1, 0.0, 1, 1, 1])}, r"no funnel: rho\[2\] = 0: must be > 0"),
-        ({"rho": np.array([1, np.nan, 1.0, 1, 1, 1])}, r"no funnel: rho\[1\] = nan: must be > 0"),
+        ({"rho": np.array([1, np.nan, 1.0, 1, 1, 1])}, "numbers in rho that are not finite"),
         ({"S": np.tile(np.diag([1.0, -1.0]), (6, 1, 1))}, "no funnel: an S is not positive definite"),
     ],
 )
