@@ -267,7 +267,7 @@ def test_numbers_that_no_robot_has_are_refused(tmp_path, capsys, arguments, reas
         ("h\n0,1e308,0,0,1,1,0,1\n", "cell 2 = '1e308'"),
         ("h\n0,0,0,0,1,1,0," + "1" * 200_000 + "\n", "field larger than field limit"),
         ("h\n0,3.14159265,0,0,1,1,0,1\n1,2\n", "line 3 has 2 cells, the first row 8"),
-        ("h\n0,0,0,0,1,5e-324,0,5e-324\n1,3.14159265,0,0,1,1,0,1\n", "S of knot 0 must be positive"),
+        ("h\n0,0,0,0,1,1e-300,0,1e-300\n1,3.14159265,0,0,1,1,0,1\n", "the volume of knot 0 is beyond all numbers"),
         ("", "is empty: must be a table of the columns time, theta, theta_dot, input, rho, upper triangle of S"),
         ("h\n\x00\n", "is no text"),
     ],

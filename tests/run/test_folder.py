@@ -329,16 +329,15 @@ def test_a_damaged_configuration_is_named(tmp_path):
     assert "config.yaml: no valid YAML" in refused(tmp_path / "run")
 
 
-def test_missing_lines_are_refused(tmp_path):
-    config = experiment(generations=4)
-    drive(tmp_path / "run", config)
+def test_lines_that_no_state_fits_are_refused(tmp_path):
+    config, plan = at_generations(tmp_path / "run", 3, 6)
     lines = (tmp_path / "run" / "generations.jsonl").read_bytes().splitlines(keepends=True)
-    (tmp_path / "run" / "generations.jsonl").write_bytes(b"".join(lines[:1]))
+    (tmp_path / "run" / "generations.jsonl").write_bytes(b"".join(lines[:2]))
     with (
         RunFolder.open(tmp_path / "run", config) as folder,
-        pytest.raises(UserError, match=r"has 1 complete lines, but .* of generation \d: the folder was changed"),
+        pytest.raises(UserError, match=r"has 2 complete lines, but .* is of generation 6: the folder was changed"),
     ):
-        folder.restore(begin(plan_of(config)))
+        folder.restore(begin(plan))
 
 
 @pytest.mark.parametrize("like", [{"a": jnp.zeros(3)}, {"b": jnp.zeros(2)}, {"a": jnp.zeros(2), "b": jnp.zeros(1)}])
