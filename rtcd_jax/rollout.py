@@ -70,7 +70,7 @@ def tracking_data(problem: Problem, candidate: Candidate, policy: Policy, steps:
     stages = 2 * np.arange(steps)[:, None] + np.arange(3)
     gains = jnp.moveaxis(policy.gains, 0, -1)[None]
     shares = grid[:, None, None, None]
-    blended = (1 - shares) * gains[..., :-1] + shares * gains[..., 1:]
+    blended = gains[..., :-1] * (1 - shares) + gains[..., 1:] * shares
     return TrackingData(
         states=jnp.moveaxis(motion.at(grid), -1, 0)[stages],
         gains=blended[stages],

@@ -6,7 +6,7 @@
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from math import inf
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, cast
 
 from pydantic import Field, GetCoreSchemaHandler, SerializeAsAny
 from pydantic_core.core_schema import CoreSchema, no_info_plain_validator_function
@@ -164,7 +164,9 @@ class Option:
     logarithmic: bool = False
 
     def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
-        return no_info_plain_validator_function(self._read, serialization=handler(source).get("serialization"))
+        return no_info_plain_validator_function(
+            self._read, serialization=cast(Any, handler(source).get("serialization"))
+        )
 
     def _read(self, data: Any) -> float | Variable:
         if isinstance(data, Mapping | Variable):

@@ -70,6 +70,7 @@ class _Loader(yaml.SafeLoader):
         alias = self.check_event(yaml.AliasEvent)
         self._depth += 1
         node = super().compose_node(parent, index)
+        assert node is not None
         self._depth -= 1
         if not alias:
             self._sizes[id(node)] = 1 + sum(self._sizes[id(child)] for child in _children(node))

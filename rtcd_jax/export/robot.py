@@ -91,7 +91,7 @@ def _link(model: Any, body: int) -> Xml.Element:
         Xml.SubElement(inertial, "mass", value=_numbers(model.body_mass[body]))
         moments = dict(zip(("ixx", "iyy", "izz"), map(_numbers, model.body_inertia[body]), strict=True))
         Xml.SubElement(inertial, "inertia", moments | {"ixy": "0", "ixz": "0", "iyz": "0"})
-    for geom in np.flatnonzero(model.geom_bodyid == body):
+    for geom in np.flatnonzero(model.geom_bodyid == body).tolist():
         link.extend(_visual(model, geom))
     return link
 

@@ -4,27 +4,36 @@ A batch of 2 x 2 systems is vectorized over the batch, not over the 2: with the 
 line below is one SIMD operation over all problems, and no problem's result depends on its neighbors.
 """
 
+from collections.abc import Iterable
+from typing import cast
+
+import jax
 import jax.numpy as jnp
 
 
-def mm(a, b):
+def _total(terms: Iterable[jax.Array]) -> jax.Array:
+    """The sum of one term or more."""
+    return cast(jax.Array, sum(terms))
+
+
+def mm(a, b) -> jax.Array:
     """A B for [i k P] and [k j P]."""
-    return sum(a[:, k, None] * b[None, k] for k in range(a.shape[1]))
+    return _total(a[:, k, None] * b[None, k] for k in range(a.shape[1]))
 
 
-def mtm(a, b):
+def mtm(a, b) -> jax.Array:
     """A' B for [k i P] and [k j P]."""
-    return sum(a[k, :, None] * b[k, None, :] for k in range(a.shape[0]))
+    return _total(a[k, :, None] * b[k, None, :] for k in range(a.shape[0]))
 
 
-def mv(a, v):
+def mv(a, v) -> jax.Array:
     """A v for [i k P] and [k P]."""
-    return sum(a[:, k] * v[k] for k in range(a.shape[1]))
+    return _total(a[:, k] * v[k] for k in range(a.shape[1]))
 
 
-def mtv(a, v):
+def mtv(a, v) -> jax.Array:
     """A' v for [k i P] and [k P]."""
-    return sum(a[k] * v[k] for k in range(a.shape[0]))
+    return _total(a[k] * v[k] for k in range(a.shape[0]))
 
 
 def transpose(a):

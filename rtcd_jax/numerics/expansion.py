@@ -104,7 +104,7 @@ def expander(rate: Callable, running: Callable, n: int, m: int, parameters) -> C
 def _forward(f: Differentiated, x, u, h, p):
     """The step's slopes, and z_i, f_z, Y_i of every stage."""
     n, m = f.n, len(u)
-    eye = [[float(i == j) for j in range(n + 1 + m)] for i in range(n + 1 + m)]
+    eye: Matrix = [[float(i == j) for j in range(n + 1 + m)] for i in range(n + 1 + m)]
     place, motion, stages, increments = x, eye[:n], [], []
     for reach in (*REACH[1:], None):
         z, by_z = (*place, *u), motion + eye[n + 1 :]

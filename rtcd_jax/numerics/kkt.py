@@ -63,7 +63,7 @@ def solve(problem: Subproblem, floor: float = 1e-12) -> Step:
     n, batch = problem.defects.shape[1:]
     dtype = problem.defects.dtype
     zero, one = jnp.zeros((batch,), dtype), jnp.ones((batch,), dtype)
-    identity = [[one if i == j else zero for j in range(n + 1)] for i in range(n)]
+    identity: Matrix = [[one if i == j else zero for j in range(n + 1)] for i in range(n)]
     last = _Value(
         quadratic=[[zero] * (i + 1) for i in range(n + 1)],
         linear=[zero] * (n + 1),

@@ -11,7 +11,7 @@ import math
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -44,7 +44,9 @@ def repeat(times: int, f: Callable, init):
     return short_scan(lambda carry, _: (f(carry), None), init, length=times)[0]
 
 
-def packed_scan(f: Callable, init, xs, *, shared: int = 0, unroll: int = 1, reverse: bool = False, carry: bool = True):
+def packed_scan(
+    f: Callable, init, xs, *, shared: int = 0, unroll: int = 1, reverse: bool = False, carry: bool = True
+) -> tuple[Any, Any]:
     """`jax.lax.scan`; on a GPU with one array each for a step's inputs, its outputs and, if wanted, the carry.
 
     A scan reads and writes every leaf by an operation of its own, which no CUDA graph takes in. The last `shared` axes

@@ -104,7 +104,7 @@ class Cartpole(Plant):
         """As the base class; ValueError if the inertia is neither the rod's nor the measured one."""
         constants = (parameters[name] for name in ("Mc", "Beq", "Bp", "g", "force_limit"))
         length, mass, inertia = (parameters[name] for name in ("lp", "Mp", "inertia_about_com"))
-        known = {"measured": MEASURED_INERTIA, "rod": mass * length**2 / 3}
+        known: dict[Literal["measured", "rod"], float] = {"measured": MEASURED_INERTIA, "rod": mass * length**2 / 3}
         kinds = [kind for kind, value in known.items() if math.isclose(inertia, value, rel_tol=1e-6)]
         if not kinds:
             raise ValueError(f"inertia_about_com = {inertia:g}: must be one of {known} [kg m^2]")

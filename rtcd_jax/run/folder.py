@@ -18,7 +18,7 @@ import socket
 import time
 from collections.abc import Iterable, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Self, TypeVar, final
+from typing import TYPE_CHECKING, Any, Self, TypeVar, cast, final
 
 import numpy as np
 
@@ -336,8 +336,8 @@ def _checkpoints(path: Path) -> Iterator[Any]:
     kinds = (OSError, ValueError)
     with writing(path, kinds):
         checkpointer = ocp.training.Checkpointer(
-            path.absolute(),
-            preservation_policy=ocp.training.preservation_policies.LatestN(KEPT_STATES),
+            str(path.absolute()),
+            preservation_policy=cast(Any, ocp.training.preservation_policies.LatestN(KEPT_STATES)),
             cleanup_tmp_directories=True,
         )
     try:

@@ -46,7 +46,9 @@ class Spread:
         return found
 
 
-def spread(evaluate: Evaluate, cluster: Cluster, chunk: int) -> Callable[[Float[np.ndarray, "P d"], Key], Spread]:
+def spread(
+    evaluate: Evaluate, cluster: Cluster, chunk: int
+) -> Callable[[Float[Array | np.ndarray, "P d"], Key], Spread]:
     """`evaluate` for populations of any size, `chunk` candidates on every device of the cluster at a time.
 
     The genomes are process 0's. The last chunks are filled up with copies of the last genome. Between chunks the
@@ -56,7 +58,7 @@ def spread(evaluate: Evaluate, cluster: Cluster, chunk: int) -> Callable[[Float[
     on_devices = cluster.shared(lambda genomes, key: evaluate(genomes, jax.random.wrap_key_data(key)))
     fetch = partial(_fetch, cluster, cluster.shared(partial(_rows, chunk)), chunk)
 
-    def evaluate_all(genomes: Float[np.ndarray, "P d"], key: Key[Array, ""]) -> Spread:
+    def evaluate_all(genomes: Float[Array | np.ndarray, "P d"], key: Key[Array, ""]) -> Spread:
         genomes = cluster.agreed(np.asarray(genomes))
         count = len(genomes)
         padded = np.concatenate([genomes, np.repeat(genomes[-1:], -count % size, 0)])

@@ -16,11 +16,11 @@ class Evaluated(Protocol):
     """A population's evaluation, wherever its records are: an Evaluation, or one that is spread over devices."""
 
     @property
-    def genome(self) -> Float[Array, "P d"]: ...
+    def genome(self) -> Float[Array | np.ndarray, "P d"]: ...
     @property
     def volumes(self) -> Volumes: ...
     @property
-    def status(self) -> Int[Array, " P"]: ...
+    def status(self) -> Int[Array | np.ndarray, " P"]: ...
 
     def take(self, rows: np.ndarray, /) -> Evaluation:
         """The whole records of the candidates at `rows` [E]."""
@@ -85,7 +85,7 @@ def merge(
         fresh = evaluation.take(np.where(filled & enters, chosen, chosen[filled & enters][0]) - capacity)
         records = jax.tree.map(lambda new, old: np.where(_like(enters, new), new, old), fresh, records)
     born = np.broadcast_to(np.asarray(generation, np.int32), evaluation.status.shape)
-    found = Elites(records, kept, np.concatenate([elites.generations, born])[chosen])
+    found = Elites(records, kept, jnp.concatenate([elites.generations, born])[chosen])
     blank = empty(capacity, elites.evaluation)
     return jax.tree.map(lambda new, old: jnp.asarray(np.where(_like(filled, new), new, old)), found, blank)
 

@@ -12,7 +12,7 @@ All randomness of a generation is fold_in(key(seed), index): the same state alwa
 import dataclasses
 import functools
 from collections.abc import Callable, Iterator
-from typing import NamedTuple, Self, final
+from typing import Any, NamedTuple, Protocol, Self, final
 
 import equinox as eqx
 import jax
@@ -172,7 +172,16 @@ def finish(plan: Plan, state: SearchState, evaluation: Evaluation) -> Elites:
     return elites.merge(none, evaluation, plan.settings.objective, first.generations, 0.0)
 
 
-def _loop(plan: Plan) -> Joint | Nested:
+class _Loop(Protocol):
+    """One search or nested ones; the states are its own."""
+
+    def start(self) -> Any: ...
+    def ask(self, state: Any, key: Key[Array, ""], /) -> tuple[Any, Array, Array]: ...
+    def tell(self, state: Any, points: Array, costs: Array, key: Key[Array, ""], /) -> tuple[Any, Array]: ...
+    def sigma(self, state: Any, /) -> Array: ...
+
+
+def _loop(plan: Plan) -> _Loop:
     settings = plan.settings
     if settings.mode == "joint":
         strategy = cmaes.Strategy(len(plan.initial), settings.population, settings.sigma)
@@ -214,7 +223,7 @@ class _Seen(NamedTuple):
     def of(cls, evaluation: Evaluated, objective: str) -> Self:
         volumes = evaluation.volumes.named
         costs = elites.cost(evaluation, objective)
-        seen = jax.device_get(cls(evaluation.genome, evaluation.status, costs, volumes))
+        seen = cls(*jax.device_get((evaluation.genome, evaluation.status, costs, volumes)))
         feasible = np.isfinite(seen.costs)
         return seen._replace(volumes={name: np.where(feasible, v, np.nan) for name, v in seen.volumes.items()})
 

@@ -87,8 +87,8 @@ def _draw_statuses(axes: "Axes", index: np.ndarray, generations: Generations) ->
     shares = failures(generations)
     below = np.zeros(len(index))
     for name, share in shares.items():
-        look = {"label": status_words(name), "color": STATUS_COLORS.get(name, GRAY)}
-        axes.fill_between(index, below, below + share, step="mid", lw=0, **look)
+        label, color = status_words(name), STATUS_COLORS.get(name, GRAY)
+        axes.fill_between(index, below, below + share, step="mid", lw=0, label=label, color=color)
         below = below + share
     axes.set(ylabel="candidates\nby status [-]", ylim=(0, 1.0))
     axes.legend(loc="lower right", ncols=len(shares), frameon=True, framealpha=0.8, edgecolor="none")

@@ -3,7 +3,7 @@
 import json
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, final
+from typing import Any, cast, final
 
 from rtcd_jax.analysis.report.history import OPTIONS
 from rtcd_jax.analysis.report.reading import Experiment, Run
@@ -103,7 +103,7 @@ def ranks(run: Run) -> tuple[float, int] | None:
         return None
     from scipy.stats import spearmanr
 
-    return float(spearmanr(sums)[0]), len(sums)
+    return float(cast(Any, spearmanr(sums)).statistic), len(sums)
 
 
 def verification(runs: Sequence[Run]) -> Table | None:

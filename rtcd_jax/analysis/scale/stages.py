@@ -14,12 +14,13 @@ from jaxtyping import Int
 from rtcd_jax import funnel
 from rtcd_jax.analysis.scale.clock import timed
 from rtcd_jax.config.load import Config
-from rtcd_jax.evaluation import make_evaluate, search_budget
+from rtcd_jax.evaluation import device_chunk, make_evaluate, search_budget
 from rtcd_jax.genome import decode, initial_genome
 from rtcd_jax.policy import stabilize
 from rtcd_jax.problem import make_problem
 from rtcd_jax.run.folder import RunFolder
 from rtcd_jax.search import search
+from rtcd_jax.system.devices import memory_of
 from rtcd_jax.trajectory import plan
 from rtcd_jax.validation import Rollouts, validate_intervals
 
@@ -43,7 +44,7 @@ def stages(config: Config, population: int) -> Iterator[Stage]:
     problem = make_problem(config)
     budget = search_budget(problem)
     key = jax.random.key(0)
-    chunk = min(config.search.chunk, population)
+    chunk = device_chunk(problem, population, memory_of(jax.local_devices()[0]))
 
     def measure(function: Callable, *arguments):
         compiled, compilation = timed(lambda: jax.jit(function).lower(*arguments).compile())

@@ -118,7 +118,7 @@ def _nearest(
     room = np.full_like(x, np.inf)
     room[1:-1] = INSIDE * limits
     bounds = np.concatenate([room.ravel(), np.full(len(u), INSIDE * external.limit)])
-    bounded = sp.identity(len(bounds), format="csr")[np.isfinite(bounds)]
+    bounded = sp.csr_matrix(sp.identity(len(bounds)))[np.isfinite(bounds)]
     finite = bounds[np.isfinite(bounds)]
     settings = clarabel.DefaultSettings()
     settings.verbose = False
@@ -141,7 +141,7 @@ def _nearest(
 def _linearized(x: np.ndarray, u: np.ndarray, now: Flow) -> tuple[Any, np.ndarray]:
     """Sparse rows and right sides of x_{k+1} - A_k x_k - B_k u_k = Phi_k - A_k x_k^0 - B_k u_k^0, and of the ends."""
     knots, n = x.shape
-    ends = sp.identity(x.size, format="csr")[[*range(n), *range(x.size - n, x.size)]]
+    ends = sp.csr_matrix(sp.identity(x.size))[[*range(n), *range(x.size - n, x.size)]]
     states = sp.kron(sp.eye(knots - 1, knots, k=1), sp.identity(n)) - sp.block_diag(now.by_state) @ sp.kron(
         sp.eye(knots - 1, knots), sp.identity(n)
     )

@@ -61,7 +61,9 @@ class Node(NamedTuple):
         return [Node(f"{self.place}[{i}]", v) for i, v in enumerate(self.value)]
 
     def number(self):
-        self.insist(isinstance(self.value, str) and _DOUBLE.fullmatch(self.value), "must be a double in hexadecimal")
+        self.insist(
+            isinstance(self.value, str) and bool(_DOUBLE.fullmatch(self.value)), "must be a double in hexadecimal"
+        )
         try:
             return Q(*float.fromhex(self.value).as_integer_ratio())
         except OverflowError:

@@ -6,7 +6,7 @@ raised, the interval halved, and the rate raised again.
 """
 
 from collections.abc import Iterator
-from typing import NamedTuple, final
+from typing import Any, NamedTuple, cast, final
 
 import numpy as np
 
@@ -161,6 +161,6 @@ def prove(
         if found is None:
             return None
         witnesses[case] = found.witness
-        margin = float(check.margin(each, found.witness, case)) if exact else found.margin
+        margin = float(cast(Any, check.margin(each, found.witness, case))) if exact else found.margin
         least = min(least, margin)
     return witnesses, least

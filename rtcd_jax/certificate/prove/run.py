@@ -6,7 +6,7 @@ import queue
 from collections.abc import Iterator, Sequence
 from concurrent.futures import Future
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 from scipy.stats import spearmanr
 
@@ -101,7 +101,7 @@ def _work(folder: Path, name: str, rung: str, optimize_value: bool) -> Outcome |
 def rank_correlation(outcomes: Sequence[Outcome]) -> float:
     """Spearman's, between the sampled and the shown sums of volumes: 1 if the proof would rank the elites the same."""
     sums = [[outcome.sampled["sum"], outcome.found["sum"]] for outcome in outcomes]
-    return float(spearmanr(sums)[0])
+    return float(cast(Any, spearmanr(sums)).statistic)
 
 
 def _summary(outcome: Outcome | None) -> dict[str, Any] | None:

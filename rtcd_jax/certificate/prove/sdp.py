@@ -16,7 +16,7 @@ same program as cvxpy states it, built once and solved for many data.
 import math
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
-from typing import Any, NamedTuple, final
+from typing import Any, NamedTuple, cast, final
 
 import numpy as np
 import scipy.sparse as sp
@@ -252,7 +252,7 @@ class CvxpyProgram:
         p.value = data.p
         for parameter, value in zip(g, data.g, strict=True):
             parameter.value = value
-        return float(problem.solve(solver="CLARABEL", ignore_dpp=False))
+        return float(cast(float, problem.solve(solver="CLARABEL", ignore_dpp=False)))
 
 
 def _cvxpy_maps(n: int, degree: int, side: int) -> list[sp.csc_matrix]:
