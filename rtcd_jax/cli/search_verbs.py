@@ -9,7 +9,7 @@ from pydantic import AfterValidator, Field, PlainValidator
 
 from rtcd_jax.cli.config_options import config_branch
 from rtcd_jax.cli.exits import Exit, say
-from rtcd_jax.cli.options import FLAT, OPTIMIZE_USAGE, Options, Positional, shown
+from rtcd_jax.cli.options import FLAT, OPTIMIZE_USAGE, Cache, Options, Positional, shown
 from rtcd_jax.config.load import EXAMPLE, Config, load, parse, parse_yaml
 from rtcd_jax.config.schema import SMALLEST_POPULATION
 from rtcd_jax.config.settings import Settings, invalid, refusal
@@ -34,9 +34,7 @@ class Machines(Settings):
     cpu_devices: Annotated[int | None, shown("INT", "its cores")] = Field(
         default=None, description="parts the CPU is split into [-]", ge=1
     )
-    cache: Annotated[str | None, shown("DIR", "~/.cache/rtcd_jax/xla")] = Field(
-        default=None, description="of compiled programs, '' for none"
-    )
+    cache: Cache = Field(default=None, description="of compiled programs, '' for none")
     coordinator: Annotated[str | None, shown("HOST:PORT", _UNDER_SRUN)] = Field(
         default=None, description="where process 0 listens"
     )
@@ -62,18 +60,18 @@ def on_cluster(
 ) -> Exit:
     """Joins the other processes of `machines`, if any, and does `work(console, cluster)`; only the first one speaks."""
     prepare_jax(machines.cpu_devices, machines.cache)
-    from rtcd_jax.system.cluster import Cluster, Lost, Preempted, join, part
+    from rtcd_jax.system.cluster import Cluster, Lost, Preempted, initialize, shutdown
 
-    join(machines.coordinator, machines.num_processes, machines.process_id)  # before anything touches a device
+    initialize(machines.coordinator, machines.num_processes, machines.process_id)  # before anything touches a device
     cluster = Cluster.of(machines.devices)
-    cluster.heed()
+    cluster.handle_sigterm()
     speaker = console if cluster.first else silent()
     try:
-        cluster.meet()
+        cluster.barrier()
         work(speaker, cluster)
     except Preempted:
         speaker.message(f"asked to stop (SIGTERM): saved in {folder}; the same command goes on")
-        part()
+        shutdown()
         return Exit.PREEMPTED
     except Lost as error:
         say(f"rtcd: {error}; start all of them again by the same command, to go on")

@@ -333,7 +333,7 @@ def _checkpoints(path: Path) -> Iterator[Any]:
     """Orbax's checkpointer; closing it waits for its threads, and tells again of a save that failed."""
     from orbax.checkpoint import v1 as ocp
 
-    kinds = (OSError, ValueError)
+    kinds = (OSError, ValueError, RecursionError)
     with writing(path, kinds):
         checkpointer = ocp.training.Checkpointer(
             str(path.absolute()),
@@ -354,7 +354,7 @@ def _load(checkpointer: Any, checkpoint: Any, state: State) -> State:
     shapes = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=x.sharding), state)
     try:
         loaded = checkpointer.load(checkpoint.step, shapes)
-    except (KeyError, ValueError, OSError) as error:
+    except (KeyError, ValueError, OSError, RecursionError) as error:
         raise UserError(
             f"{checkpoint.path} is no state of this search: it is damaged, or another version or precision wrote it; "
             "go on with what provenance.json names, or choose another folder"

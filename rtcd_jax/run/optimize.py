@@ -16,7 +16,7 @@ from rtcd_jax.problem import Problem, make_problem
 from rtcd_jax.run.folder import RunFolder
 from rtcd_jax.run.format import arrays_of, record_of
 from rtcd_jax.run.reevaluation import Reevaluation, Reported, physics_line, row
-from rtcd_jax.run.sharding import Spread, spread
+from rtcd_jax.run.sharding import Sharded, sharded
 from rtcd_jax.search import search
 from rtcd_jax.search.archive import Elites
 from rtcd_jax.system.cluster import Cluster, Preempted
@@ -41,7 +41,7 @@ def optimize(config: Config, folder: Path, console: Console, cluster: Cluster) -
     problem = make_problem(config)
     share = -(-config.search.population // len(cluster.devices))
     chunk = device_chunk(problem, share, cluster.memory)
-    evaluate = spread(make_evaluate(problem), cluster, chunk)
+    evaluate = sharded(make_evaluate(problem), cluster, chunk)
     plan = search.Plan(config.search, config.elites, tuple(initial_genome(problem).tolist()), problem.design_dims)
     genomes = jnp.zeros((config.search.population, len(problem.free)))
     example = jax.eval_shape(make_evaluate(problem), genomes, jax.random.key(0))
@@ -66,7 +66,7 @@ def optimize(config: Config, folder: Path, console: Console, cluster: Cluster) -
                 run.append(vars(generation))
                 run.save_if_due(state, int(state.generation))
                 console.progress(pace.progress(generation))
-                cluster.look(int(state.generation))
+                cluster.raise_if_preempted(int(state.generation))
         except Preempted:
             run.save(state, int(state.generation))
             raise
@@ -135,7 +135,7 @@ def _stacked(evaluations: list[Evaluation], elites: Elites) -> Evaluation:
     return jax.tree.map(lambda *leaves: np.stack(leaves), *rows)
 
 
-def _initial(problem: Problem, evaluate: Callable[..., Spread]) -> Evaluation:
+def _initial(problem: Problem, evaluate: Callable[..., Sharded]) -> Evaluation:
     genome = np.asarray(initial_genome(problem))
     return row(evaluate(genome[None], jax.random.key(0)).take(np.array([0])), 0)
 

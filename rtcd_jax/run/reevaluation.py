@@ -44,7 +44,7 @@ class Reevaluation:
     def __init__(self, problem: Problem, cluster: Cluster, population: Evaluation, console: Console):
         self._elites, self._key = problem.config.elites, elite_key()
         self._cluster, self._console = cluster, console
-        self._looks = problem.config.search.generations
+        self._checks = problem.config.search.generations
         self._budget = elite_budget(problem)
         self._resample = _OnDevices(partial(resample, problem, self._budget), cluster, population)
         if self._elites.mjx_states:
@@ -94,8 +94,8 @@ class Reevaluation:
 
     def _tell(self, what: str, count: int) -> Callable[[int], None]:
         def tell(done: int) -> None:
-            self._looks += 1
-            self._cluster.look(self._looks)
+            self._checks += 1
+            self._cluster.raise_if_preempted(self._checks)
             if done:
                 self._console.message(f"{what}: {done} of {count}")
 

@@ -25,7 +25,7 @@ POLL = 0.01
 
 @final
 @dataclass(frozen=True)
-class Spread:
+class Sharded:
     """A population's evaluation. The numbers that a search looks at are at hand, volumes but for those of the knots;
     whole records stay on the devices until they are taken."""
 
@@ -46,19 +46,19 @@ class Spread:
         return found
 
 
-def spread(
+def sharded(
     evaluate: Evaluate, cluster: Cluster, chunk: int
-) -> Callable[[Float[Array | np.ndarray, "P d"], Key], Spread]:
+) -> Callable[[Float[Array | np.ndarray, "P d"], Key], Sharded]:
     """`evaluate` for populations of any size, `chunk` candidates on every device of the cluster at a time.
 
     The genomes are process 0's. The last chunks are filled up with copies of the last genome. Between chunks the
-    cluster looks whether it was asked to stop, and raises Preempted.
+    cluster checks whether it was asked to stop, and raises Preempted.
     """
     size = chunk * len(cluster.devices)
     on_devices = cluster.shared(lambda genomes, key: evaluate(genomes, jax.random.wrap_key_data(key)))
     fetch = partial(_fetch, cluster, cluster.shared(partial(_rows, chunk)), chunk)
 
-    def evaluate_all(genomes: Float[Array | np.ndarray, "P d"], key: Key[Array, ""]) -> Spread:
+    def evaluate_all(genomes: Float[Array | np.ndarray, "P d"], key: Key[Array, ""]) -> Sharded:
         genomes = cluster.agreed(np.asarray(genomes))
         count = len(genomes)
         padded = np.concatenate([genomes, np.repeat(genomes[-1:], -count % size, 0)])
@@ -66,7 +66,7 @@ def spread(
         parts = [on_devices(cluster.split(part), whole) for part in np.split(padded, len(padded) // size)]
         seen = [_seen(cluster, part) for part in parts]
         status, volumes = jax.tree.map(lambda *leaves: np.concatenate(leaves)[:count], *seen)
-        return Spread(genomes, status, volumes, tuple(parts), fetch)
+        return Sharded(genomes, status, volumes, tuple(parts), fetch)
 
     return evaluate_all
 
@@ -75,7 +75,7 @@ def _seen(cluster: Cluster, part: Evaluation) -> tuple[np.ndarray, Volumes]:
     done = cast(Any, part.status).is_ready
     while not done():
         time.sleep(POLL)
-    cluster.look()
+    cluster.raise_if_preempted()
     return cluster.gathered((part.status, replace(part.volumes, per_knot=part.volumes.per_knot[:, :0])))
 
 

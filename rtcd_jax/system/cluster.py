@@ -27,7 +27,7 @@ SPLIT, WHOLE = PartitionSpec("candidates"), PartitionSpec()
 Value = TypeVar("Value")
 
 
-def join(coordinator: str | None = None, processes: int | None = None, index: int | None = None) -> None:
+def initialize(coordinator: str | None = None, processes: int | None = None, index: int | None = None) -> None:
     """Makes this process one of the run's: as told, or as srun or mpirun tell JAX; otherwise it is alone."""
     told = {"coordinator_address": coordinator, "num_processes": processes, "process_id": index}
     started = (os.environ.get(name, "1") for name in ("SLURM_STEP_NUM_TASKS", "OMPI_COMM_WORLD_SIZE"))
@@ -35,7 +35,7 @@ def join(coordinator: str | None = None, processes: int | None = None, index: in
         jax.distributed.initialize(**told, heartbeat_timeout_seconds=HEARTBEAT)
 
 
-def part() -> None:
+def shutdown() -> None:
     """Leaves the other processes, all at once; does nothing for a process that is alone."""
     if jax.process_count() > 1:
         jax.distributed.shutdown()
@@ -102,7 +102,7 @@ class Cluster:
         count = f"{len(self.devices)} {self.devices[0].device_kind} device{'s' if len(self.devices) > 1 else ''}"
         return f"{count} of {self.processes} processes" if self.processes > 1 else count
 
-    def meet(self) -> None:
+    def barrier(self) -> None:
         """Opens the links between the processes, while none has work yet: that waits for the others for seconds only,
         and later one may compile for minutes longer than another."""
         self.agreed(np.zeros(1))
@@ -167,20 +167,20 @@ class Cluster:
         mapped = jax.shard_map(function, mesh=self.mesh, in_specs=(SPLIT, WHOLE), out_specs=SPLIT, check_vma=False)
         return jax.jit(mapped)
 
-    def heed(self) -> None:
+    def handle_sigterm(self) -> None:
         """From now on SIGTERM asks this run to stop; JAX itself listens where there are several processes."""
         if self.processes == 1:
             signal.signal(signal.SIGTERM, lambda *_: self.ask_to_stop())
 
     def ask_to_stop(self) -> None:
-        """Makes the next look raise."""
+        """Makes the next check raise."""
         self._asked = True
 
-    def look(self, step: int | None = None) -> None:
+    def raise_if_preempted(self, step: int | None = None) -> None:
         """Raises Preempted if this run was asked to stop.
 
-        Several processes agree on one of their looks, for which they need a `step` that grows from look to look: that
-        of the checkpoint where one is saved, because orbax looks, too. Without a step only a process alone looks.
+        Several processes agree on one of their checks, for which they need a `step` that grows from check to check:
+        that of the checkpoint where one is saved, because orbax checks, too. Without a step only a process alone does.
         """
         together = self.processes > 1 and step is not None and multihost_utils.reached_preemption_sync_point(step)
         if self._asked or together:

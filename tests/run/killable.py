@@ -13,19 +13,19 @@ from pathlib import Path
 import jax
 
 from rtcd_jax.cli.exits import Exit
-from rtcd_jax.system.cluster import Cluster, Lost, join
+from rtcd_jax.system.cluster import Cluster, Lost, initialize
 
 
 def main(path, mode, seconds, devices="1", port=None, processes="1", index="0"):
     jax.config.update("jax_enable_x64", True)
     jax.config.update("jax_num_cpu_devices", int(devices))
-    join(*(() if port is None else (f"127.0.0.1:{port}", int(processes), int(index))))
+    initialize(*(() if port is None else (f"127.0.0.1:{port}", int(processes), int(index))))
     from tests.search.search_driver import drive, experiment  # imports that touch a device
 
     cluster = Cluster.of()
-    cluster.heed()
+    cluster.handle_sigterm()
     try:
-        cluster.meet()
+        cluster.barrier()
         drive(Path(path), experiment(mode), float(seconds), cluster)
     except Lost as error:
         print(error, flush=True)

@@ -15,9 +15,9 @@ import yaml
 from rtcd_jax.cli.exits import Exit
 from rtcd_jax.config import load as configuration
 from rtcd_jax.run import folder as storage
-from rtcd_jax.run.sharding import spread
+from rtcd_jax.run.sharding import sharded
 from rtcd_jax.search import search
-from rtcd_jax.system.cluster import Cluster, Preempted, part
+from rtcd_jax.system.cluster import Cluster, Preempted, shutdown
 from tests.search.fake_evaluation import bowl
 
 CHUNK = 4
@@ -51,7 +51,7 @@ def drive(path, config, seconds=0.0, cluster=None):
     plan = plan_of(config)
     print("opening", flush=True)
     cluster = cluster or Cluster.of()
-    evaluate = spread(bowl, cluster, CHUNK)
+    evaluate = sharded(bowl, cluster, CHUNK)
     with storage.RunFolder.open(path, config, cluster) as folder:
         begun = state = folder.restore(begin(plan))
         print("from", int(begun.generation), flush=True)
@@ -61,11 +61,11 @@ def drive(path, config, seconds=0.0, cluster=None):
                 folder.append(vars(record))
                 print("generation", record.index, flush=True)
                 folder.save_if_due(state, int(state.generation))
-                cluster.look(int(state.generation))
+                cluster.raise_if_preempted(int(state.generation))
         except Preempted:
             folder.save(state, int(state.generation))
             print("preempted", int(state.generation), flush=True)
-            part()
+            shutdown()
             os._exit(Exit.PREEMPTED)
         folder.save(state, int(state.generation))
         again = jax.device_get(bowl(state.elites.evaluation.genome, jax.random.key(1)))

@@ -35,7 +35,7 @@ def measure(path: Path, population: int, devices: int, repeats: int) -> dict[str
     from rtcd_jax.genome import initial_genome
     from rtcd_jax.problem import make_problem
     from rtcd_jax.run.folder import RunFolder
-    from rtcd_jax.run.sharding import spread
+    from rtcd_jax.run.sharding import sharded
     from rtcd_jax.search import search
     from rtcd_jax.system.cluster import Cluster
 
@@ -44,7 +44,7 @@ def measure(path: Path, population: int, devices: int, repeats: int) -> dict[str
     config = config.model_copy(update={"search": settings})
     problem, cluster = make_problem(config), Cluster.of(devices)
     chunk = device_chunk(problem, -(-population // devices), cluster.memory)
-    spread_out, evaluations = spread(make_evaluate(problem), cluster, chunk), []
+    spread_out, evaluations = sharded(make_evaluate(problem), cluster, chunk), []
 
     def evaluate(genomes, key):
         found, took = timed(lambda: spread_out(genomes, key))
