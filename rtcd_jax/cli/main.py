@@ -44,7 +44,7 @@ class Verb:
             return function(words)
         options = first.annotation.read(words, f"rtcd {name}")
         if self.jax:
-            prepare_jax()
+            prepare_jax(cache=getattr(options, "cache", None))
         from rtcd_jax.system.console import Console
 
         with Console() as console:

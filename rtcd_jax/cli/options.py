@@ -66,6 +66,9 @@ def shown(metavar: str | None = None, otherwise: str | None = None) -> Any:
     return tyro.conf.arg(metavar=metavar, help_behavior_hint=hint)
 
 
+Cache = Annotated[str | None, shown("DIR", "~/.cache/rtcd_jax/xla")]
+
+
 def _run_folder(path: Path) -> Path:
     if path.is_file():
         raise refusal(f"is a file; must be a run folder, as `{OPTIMIZE_USAGE}` makes one")

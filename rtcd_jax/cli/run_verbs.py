@@ -10,7 +10,7 @@ from typing import Annotated, Literal
 from pydantic import AfterValidator, Field
 
 from rtcd_jax.cli.exits import Exit
-from rtcd_jax.cli.options import Elite, ExistingRun, Options, Positional, Run, shown
+from rtcd_jax.cli.options import Cache, Elite, ExistingRun, Options, Positional, Run, shown
 from rtcd_jax.config.settings import refusal
 from rtcd_jax.system.console import Console
 from rtcd_jax.system.devices import cores
@@ -125,6 +125,7 @@ class DisturbOptions(Options):
     run: Run = Field(description="the run folder")
     states: int = Field(default=1000, description="uniform states of every first ellipsoid [-]", ge=1)
     seed: int = Field(default=0, description="of states, noise and perturbations [-]", ge=0)
+    cache: Cache = Field(default=None, description="of compiled programs, '' for none")
 
 
 def disturb(options: DisturbOptions, console: Console) -> Exit:

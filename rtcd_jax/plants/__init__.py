@@ -3,7 +3,7 @@
 from rtcd_jax.plants.base import Plant
 from rtcd_jax.plants.cartpole import Cartpole
 from rtcd_jax.plants.pendulum import Pendulum
-from rtcd_jax.system.errors import closest
+from rtcd_jax.system.errors import UserError, closest
 
 PLANTS: dict[str, type[Plant]] = {"pendulum": Pendulum, "cartpole": Cartpole}
 
@@ -12,8 +12,8 @@ def plant_class(name: str) -> type[Plant]:
     """The robot called `name`.
 
     Raises:
-        ValueError: no robot has this name.
+        UserError: no robot has this name.
     """
     if name not in PLANTS:
-        raise ValueError(f"no plant is called {name!r}; {closest(name, tuple(PLANTS))}")
+        raise UserError(f"no plant is called {name!r}; {closest(name, tuple(PLANTS))}")
     return PLANTS[name]

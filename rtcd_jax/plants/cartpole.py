@@ -20,6 +20,7 @@ from jaxtyping import Array, Float
 
 from rtcd_jax.numerics.trigonometry import cos, sin
 from rtcd_jax.plants.base import ModelEdits, Plant
+from rtcd_jax.system.errors import UserError
 
 MEASURED_INERTIA = 0.004359984
 """I of the manufactured pole [kg m^2], whatever the design's mass and length are."""
@@ -101,13 +102,13 @@ class Cartpole(Plant):
 
     @classmethod
     def from_parameters(cls, parameters: Mapping[str, float]) -> tuple["Cartpole", CartpoleDesign]:
-        """As the base class; ValueError if the inertia is neither the rod's nor the measured one."""
+        """As the base class; UserError if the inertia is neither the rod's nor the measured one."""
         constants = (parameters[name] for name in ("Mc", "Beq", "Bp", "g", "force_limit"))
         length, mass, inertia = (parameters[name] for name in ("lp", "Mp", "inertia_about_com"))
         known: dict[Literal["measured", "rod"], float] = {"measured": MEASURED_INERTIA, "rod": mass * length**2 / 3}
         kinds = [kind for kind, value in known.items() if math.isclose(inertia, value, rel_tol=1e-6)]
         if not kinds:
-            raise ValueError(f"inertia_about_com = {inertia:g}: must be one of {known} [kg m^2]")
+            raise UserError(f"inertia_about_com = {inertia:g}: must be one of {known} [kg m^2]")
         return cls(*constants, inertia=kinds[0]), CartpoleDesign(jnp.asarray(length), jnp.asarray(mass))
 
     def edit_model(self, design: CartpoleDesign) -> ModelEdits:

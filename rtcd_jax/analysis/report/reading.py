@@ -21,7 +21,7 @@ from rtcd_jax.elite.records import (
     read_generations,
 )
 from rtcd_jax.system.console import Console, Progress, silent
-from rtcd_jax.system.errors import UserError
+from rtcd_jax.system.errors import UserError, printable
 from rtcd_jax.system.files import read_json, reading
 from rtcd_jax.volume import VOLUMES
 
@@ -40,6 +40,15 @@ _OF_A_GENERATION = (
     "index", "evaluations", "objective", "best", "median", "best_so_far", "feasible", "counts", "sigma", "restarts",
     "genomes", "volumes",
 )  # fmt: skip
+
+_NUMBER = int | float | None
+_ANY_KEY = "*"
+_PROVENANCE = {"starts": [{"seconds": int | float, "versions": {}}]}
+_COUNTS = dict.fromkeys(("left_funnel", "left_limits", "missed_goal", "rate", "rate_lower", "rate_upper"), _NUMBER)
+_VERIFICATION = {
+    "states": _NUMBER, "epsilon": _NUMBER, "confidence": _NUMBER, "witnesses": {_ANY_KEY: _COUNTS},
+}  # fmt: skip
+_DISTURBANCE = {"summary": {}}
 
 
 @final
@@ -141,9 +150,11 @@ def read_run(path: Path, console: Console | None = None) -> Run:
         generations=read_search(path),
         elites={name: read_elite(elite_folder(path, name), name)[1] for name in elite_names(path)},
         certificates=dict(_certificates(path, console or silent())),
-        verification={file.stem: _json(file) for file in sorted((path / "verification").glob("*.json"))},
+        verification={
+            file.stem: _shaped(file, _VERIFICATION) for file in sorted((path / "verification").glob("*.json"))
+        },
         experiments=tuple(_experiments(path / "disturbance")),
-        provenance=_json(path / "provenance.json"),
+        provenance=_shaped(path / "provenance.json", _PROVENANCE),
     )
 
 
@@ -248,9 +259,38 @@ def _telling(console: Console, file: Path) -> Callable[[int, int], None]:
 
 def _experiments(folder: Path) -> list[Experiment]:
     return [
-        Experiment(file.stem, _json(file).get("summary", {}), tuple(sorted(folder.glob(f"{file.stem}*.png"))))
+        Experiment(
+            file.stem, _shaped(file, _DISTURBANCE).get("summary", {}), tuple(sorted(folder.glob(f"{file.stem}*.png")))
+        )
         for file in sorted(folder.glob("*.json"))
     ]
+
+
+def _shaped(path: Path, shape: Mapping[str, Any]) -> dict[str, Any]:
+    """The file's content, nothing where there is no file. Raises UserError where a value is not of the shape's kind."""
+    stored = _json(path)
+    for place in _misfits(stored, shape):
+        raise UserError(f"cannot read {path}: {printable(place)} is of another kind than a run writes; {_ADVICE}")
+    return stored
+
+
+def _misfits(value: Any, shape: Any, place: str = "") -> Iterator[str]:
+    """Where a value is of another kind: a shape is a mapping of keys to shapes, a list of one shape, or types."""
+    if isinstance(shape, Mapping):
+        if not isinstance(value, Mapping):
+            yield place
+            return
+        for key, inner in value.items():
+            if key in shape or _ANY_KEY in shape:
+                yield from _misfits(inner, shape.get(key, shape.get(_ANY_KEY)), f"{place}.{key}".lstrip("."))
+    elif isinstance(shape, list):
+        if not isinstance(value, list):
+            yield place
+            return
+        for index, inner in enumerate(value):
+            yield from _misfits(inner, shape[0], f"{place}[{index}]")
+    elif not isinstance(value, shape):
+        yield place
 
 
 def _json(path: Path) -> dict[str, Any]:
