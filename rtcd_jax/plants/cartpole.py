@@ -28,6 +28,9 @@ MEASURED_INERTIA = 0.004359984
 _POLE_RADIUS = 0.006  # [m], as drawn in cartpole.xml
 _AXIAL_INERTIA = 1e-6  # [kg m^2], as in cartpole.xml; about the pole's own axis, where nothing turns
 
+Inertia = Literal["rod", "measured"]
+"""Of the pole: a rod's, or the one that was measured."""
+
 
 @final
 class CartpoleDesign(eqx.Module):
@@ -49,7 +52,7 @@ class Cartpole(Plant):
     pivot_damping: float = 0.0024
     gravity: float = 9.81
     force_limit: float = 6.0
-    inertia: Literal["rod", "measured"] = eqx.field(default="rod", static=True)
+    inertia: Inertia = eqx.field(default="rod", static=True)
 
     state_names: ClassVar = ("cart", "theta", "cart_dot", "theta_dot")
     state_units: ClassVar = ("m", "rad", "m/s", "rad/s")
@@ -105,8 +108,8 @@ class Cartpole(Plant):
         """As the base class; UserError if the inertia is neither the rod's nor the measured one."""
         constants = (parameters[name] for name in ("Mc", "Beq", "Bp", "g", "force_limit"))
         length, mass, inertia = (parameters[name] for name in ("lp", "Mp", "inertia_about_com"))
-        known: dict[Literal["measured", "rod"], float] = {"measured": MEASURED_INERTIA, "rod": mass * length**2 / 3}
-        kinds = [kind for kind, value in known.items() if math.isclose(inertia, value, rel_tol=1e-6)]
+        known: dict[Inertia, float] = {"measured": MEASURED_INERTIA, "rod": mass * length**2 / 3}
+        kinds: list[Inertia] = [kind for kind, value in known.items() if math.isclose(inertia, value, rel_tol=1e-6)]
         if not kinds:
             raise UserError(f"inertia_about_com = {inertia:g}: must be one of {known} [kg m^2]")
         return cls(*constants, inertia=kinds[0]), CartpoleDesign(jnp.asarray(length), jnp.asarray(mass))

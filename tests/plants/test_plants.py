@@ -91,7 +91,7 @@ def test_pendulum_balances_at_the_torque_of_its_weight():
 
 
 def test_an_unknown_plant_is_answered_with_the_known_ones():
-    with pytest.raises(ValueError, match=r"'pendulun'; there are cartpole, pendulum.*did you mean 'pendulum'"):
+    with pytest.raises(ValueError, match=r"'pendulun'; did you mean 'pendulum'\? Valid: pendulum, cartpole"):
         plant_class("pendulun")
 
 
