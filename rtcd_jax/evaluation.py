@@ -9,6 +9,7 @@ from functools import partial
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from rtcd_jax import rollout
 from rtcd_jax.funnel import estimate_funnel
@@ -27,7 +28,7 @@ TEMPORARIES = 16
 """Memory of a candidate on a GPU over that of its held-out samples, as counted by launch/bench/gpu_budget.py."""
 MOST_ON_A_CPU = 512
 
-Evaluate = Callable[[jax.Array, jax.Array], Evaluation]
+Evaluate = Callable[[Float[Array, "P d"], PRNGKeyArray], Evaluation]
 
 FIRST_SAMPLES = 2000
 """Held-out samples a knot, at most, of the first, cheap rounds of the elites, and of those under further keys."""
@@ -55,7 +56,7 @@ def elite_budget(problem: Problem) -> SamplingBudget:
     )
 
 
-def elite_key() -> jax.Array:
+def elite_key() -> PRNGKeyArray:
     """The random numbers with which elites and initial candidates are evaluated again, in every run.
 
     A candidate has the same numbers in every run, whatever its seed and its generations; no search draws from this
@@ -71,7 +72,7 @@ def make_evaluate(problem: Problem, budget: SamplingBudget | None = None) -> Eva
     """
     budget = budget or search_budget(problem)
 
-    def evaluate(genomes, key) -> Evaluation:
+    def evaluate(genomes: Float[Array, "P d"], key: PRNGKeyArray) -> Evaluation:
         candidates = jax.vmap(partial(decode, problem))(genomes)
         trajectories = plan(problem, candidates)
         assess = partial(_assess, problem, budget, key)
@@ -117,14 +118,18 @@ def _padded(leaf, count: int):
 
 
 def resample(
-    problem: Problem, budget: SamplingBudget, evaluation: Evaluation, key, samples_per_knot=None
+    problem: Problem,
+    budget: SamplingBudget,
+    evaluation: Evaluation,
+    key: PRNGKeyArray,
+    samples_per_knot: Int[Array, ""] | int | None = None,
 ) -> Evaluation:
     """One candidate's evaluation with its funnel estimated anew about the same policy."""
     known = evaluation.genome, evaluation.candidate, evaluation.funnel.policy
     return _with_funnel(problem, budget, key, *known, samples_per_knot)
 
 
-def compare_with_mjx(problem: Problem, evaluation: Evaluation, key) -> PhysicsComparison:
+def compare_with_mjx(problem: Problem, evaluation: Evaluation, key: PRNGKeyArray) -> PhysicsComparison:
     """`elites.mjx_states` held-out samples of one candidate's funnel, followed to the goal by both physics."""
     funnel, config = evaluation.funnel, problem.config
     rollouts = Rollouts.of(problem, evaluation.candidate, funnel.policy, config.funnel)
@@ -132,7 +137,10 @@ def compare_with_mjx(problem: Problem, evaluation: Evaluation, key) -> PhysicsCo
 
 
 def _assess(
-    problem: Problem, budget: SamplingBudget, key, planned: tuple[jax.Array, Candidate, Trajectory]
+    problem: Problem,
+    budget: SamplingBudget,
+    key: PRNGKeyArray,
+    planned: tuple[Float[Array, " d"], Candidate, Trajectory],
 ) -> Evaluation:
     genome, candidate, trajectory = planned
     policy = stabilize(problem, candidate, trajectory)
@@ -142,11 +150,11 @@ def _assess(
 def _with_funnel(
     problem: Problem,
     budget: SamplingBudget,
-    key,
-    genome,
+    key: PRNGKeyArray,
+    genome: Float[Array, " d"],
     candidate: Candidate,
     policy: Policy,
-    samples_per_knot=None,
+    samples_per_knot: Int[Array, ""] | int | None = None,
 ) -> Evaluation:
     funnel = estimate_funnel(problem, candidate, policy, key, budget, samples_per_knot)
     return Evaluation(genome, candidate, funnel, funnel_volume(funnel), funnel.status)

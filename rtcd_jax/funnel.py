@@ -14,6 +14,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Int, PRNGKeyArray
 
 from rtcd_jax import rollout
 from rtcd_jax.numerics import sampling
@@ -43,7 +44,12 @@ MARGIN = 1e-3
 
 
 def estimate_funnel(
-    problem: Problem, candidate: Candidate, policy: Policy, key, budget: SamplingBudget, samples_per_knot=None
+    problem: Problem,
+    candidate: Candidate,
+    policy: Policy,
+    key: PRNGKeyArray,
+    budget: SamplingBudget,
+    samples_per_knot: Int[Array, ""] | int | None = None,
 ) -> Funnel:
     """The funnel of a policy (guarantee *sampled*); `key` fixes all directions, radii and held-out samples.
 

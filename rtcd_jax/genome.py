@@ -36,13 +36,13 @@ def decode(problem: Problem, genome: Float[Array, " d"]) -> Candidate:
     )
 
 
-def encode(problem: Problem, values: Sequence[float]) -> np.ndarray:
+def encode(problem: Problem, values: Sequence[float]) -> Float[np.ndarray, " d"]:
     """The genome [d] of a candidate whose variables, in the order of `problem.variables`, have these values."""
     paired = zip(problem.variables, values, strict=True)
     return np.array([_to_unit(variable, value) for variable, value in paired if variable.free])
 
 
-def initial_genome(problem: Problem) -> np.ndarray:
+def initial_genome(problem: Problem) -> Float[np.ndarray, " d"]:
     """The genome [d] of the configuration's initial candidate."""
     return encode(problem, [variable.initial for variable in problem.variables])
 

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from rtcd_jax.numerics import riccati
 from rtcd_jax.numerics.batched import mm, transpose
@@ -33,14 +33,14 @@ class Nominal(NamedTuple):
     """The nominal motion, interval by interval, as the cubic Hermite interpolant of its knots."""
 
     dt: Float[Array, ""]
-    inputs: Float[Array, "m N"]
-    starts: Float[Array, "n N"]
-    start_rates: Float[Array, "n N"]
-    ends: Float[Array, "n N"]
-    end_rates: Float[Array, "n N"]
+    inputs: Float[Array, "m intervals"]
+    starts: Float[Array, "n intervals"]
+    start_rates: Float[Array, "n intervals"]
+    ends: Float[Array, "n intervals"]
+    end_rates: Float[Array, "n intervals"]
 
-    def at(self, shares):
-        """x* [n N T] at fractions `shares` [T] of every interval."""
+    def at(self, shares: Float[Array | np.ndarray, " times"]) -> Float[Array, "n intervals times"]:
+        """x* at fractions of every interval."""
         ends = (self.starts, self.start_rates, self.ends, self.end_rates)
         return cubic_hermite(jnp.asarray(shares, self.dt.dtype), self.dt, *(leaf[:, :, None] for leaf in ends))
 
@@ -53,8 +53,10 @@ def nominal(problem: Problem, candidate: Candidate, trajectory: Trajectory) -> N
     return Nominal(trajectory.dt, us, starts, rate(starts, us), ends, rate(ends, us))
 
 
-def linearize(problem: Problem, candidate: Candidate, x, u):
-    """A [n n ...] and B [n m ...] of the dynamics at x [n ...], u [m ...]."""
+def linearize(
+    problem: Problem, candidate: Candidate, x: Float[Array, "n *batch"], u: Float[Array, "m *batch"]
+) -> tuple[Float[Array, "n n *batch"], Float[Array, "n m *batch"]]:
+    """A and B of the dynamics at x, u."""
     n = problem.plant.n
 
     def dynamics(z):
@@ -94,8 +96,8 @@ def stabilize(problem: Problem, candidate: Candidate, trajectory: Trajectory) ->
     return Policy(trajectory, jnp.moveaxis(gains, -1, 0), values, first_failure(trajectory.status, status))
 
 
-def goal_value(problem: Problem, candidate: Candidate):
-    """S [n n] of the goal's infinite-horizon LQR, and whether it exists."""
+def goal_value(problem: Problem, candidate: Candidate) -> tuple[Float[Array, "n n"], Bool[Array, ""]]:
+    """S of the goal's infinite-horizon LQR, and whether it exists."""
     goal = jnp.asarray(problem.goal, candidate.q.dtype)
     rest = jnp.zeros(problem.plant.m, goal.dtype)
     a, b = _discounted(problem, candidate, *linearize(problem, candidate, goal, rest))
@@ -108,8 +110,8 @@ def options(problem: Problem, candidate: Candidate) -> dict[str, Any]:
     return problem.config.policy.initial() | candidate.policy
 
 
-def input_weights(problem: Problem, candidate: Candidate, us):
-    """The diagonal of the controller's R [m ...] where the feed-forward is `us` [m ...]."""
+def input_weights(problem: Problem, candidate: Candidate, us: Float[Array, "m *batch"]) -> Float[Array, "m *batch"]:
+    """The diagonal of the controller's R where the feed-forward is `us`."""
     policy, behind = options(problem, candidate), (1,) * (us.ndim - 1)
     limits = jnp.asarray(problem.input_limits, us.dtype).reshape(-1, *behind)
     left = jnp.maximum(1 - jnp.abs(us) / limits, policy["authority"])

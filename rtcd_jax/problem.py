@@ -6,6 +6,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Float
 
 from rtcd_jax.config.load import Config
 from rtcd_jax.plants import plant_class
@@ -48,10 +49,10 @@ class Problem:
 
     config: Config
     plant: Plant
-    start: np.ndarray
-    goal: np.ndarray
-    state_limits: np.ndarray
-    input_limits: np.ndarray
+    start: Float[np.ndarray, " n"]
+    goal: Float[np.ndarray, " n"]
+    state_limits: Float[np.ndarray, " n"]
+    input_limits: Float[np.ndarray, " m"]
     variables: tuple[Variable, ...]
 
     @property

@@ -9,10 +9,11 @@ from collections.abc import Callable
 from functools import partial
 from typing import NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from rtcd_jax.numerics.integrate import END, MIDDLE, START, rk4_varying_step, split
 from rtcd_jax.numerics.loops import short_scan
@@ -40,7 +41,7 @@ def mjx(plant: Plant) -> Dynamics:
 
     stepper = MjxStepper(plant)
 
-    def rate(design, x, u):
+    def rate(design: eqx.Module, x: Float[Array, "n *batch"], u: Float[Array, "m *batch"]) -> Float[Array, "n *batch"]:
         over_states = jax.vmap(partial(stepper.dynamics, design), in_axes=-1, out_axes=-1)
         flat = over_states(x.reshape(plant.n, -1), u.reshape(plant.m, -1))
         return flat.reshape(x.shape)
@@ -53,12 +54,12 @@ class TrackingData(NamedTuple):
     step. Leading axes are (step, stage).
     """
 
-    states: Float[Array, "T 3 n N"]
-    gains: Float[Array, "T 3 m n N"]
-    inputs: Float[Array, "m N"]
+    states: Float[Array, "steps 3 n intervals"]
+    gains: Float[Array, "steps 3 m n intervals"]
+    inputs: Float[Array, "m intervals"]
     step: Float[Array, ""]
 
-    def part(self, which) -> "TrackingData":
+    def part(self, which: Int[Array | np.ndarray, " chosen"]) -> "TrackingData":
         """The intervals `which`."""
         return TrackingData(self.states[..., which], self.gains[..., which], self.inputs[..., which], self.step)
 
@@ -79,10 +80,16 @@ def tracking_data(problem: Problem, candidate: Candidate, policy: Policy, steps:
     )
 
 
-def roll_intervals(problem: Problem, candidate: Candidate, tracking: TrackingData, x, dynamics: Dynamics):
-    """End states [n N ...] after one interval each, and the largest |x_i| / limit_i at any step [N ...].
+def roll_intervals(
+    problem: Problem,
+    candidate: Candidate,
+    tracking: TrackingData,
+    x: Float[Array, "n intervals *batch"],
+    dynamics: Dynamics,
+) -> tuple[Float[Array, "n intervals *batch"], Float[Array, "intervals *batch"]]:
+    """End states after one interval each, and the largest |x_i| / limit_i at any step.
 
-    `x` [n N ...] are states at the intervals' starts.
+    `x` are states at the intervals' starts.
     """
     limits, bounds = problem.state_limits, _column(problem.input_limits, x)
     align = partial(_align, behind=x.ndim - 2)
@@ -100,13 +107,21 @@ def roll_intervals(problem: Problem, candidate: Candidate, tracking: TrackingDat
         x = _step(slope, x, tracking.step, dynamics.large)
         return (x, jnp.maximum(peak, _fill(x, limits))), None
 
-    x = split(x)
-    (x, peak), _ = short_scan(step, (x, _fill(x, limits)), (tracking.states, tracking.gains))
-    return jnp.stack(x), peak
+    start = split(x)
+    (ends, peak), _ = short_scan(step, (start, _fill(start, limits)), (tracking.states, tracking.gains))
+    return jnp.stack(ends), peak
 
 
-def roll_at_goal(problem: Problem, candidate: Candidate, gain, x, dynamics: Dynamics, duration: float, step: float):
-    """End states [n ...] after `duration` [s] under the goal's LQR, and the largest |x_i| / limit_i till then [...]."""
+def roll_at_goal(
+    problem: Problem,
+    candidate: Candidate,
+    gain: Float[Array, "m n"],
+    x: Float[Array, "n *batch"],
+    dynamics: Dynamics,
+    duration: float,
+    step: float,
+) -> tuple[Float[Array, "n *batch"], Float[Array, "*batch"]]:
+    """End states after `duration` [s] under the goal's LQR, and the largest |x_i| / limit_i till then."""
     limits, bounds = problem.state_limits, _column(problem.input_limits, x)
     gain = _align(gain, x.ndim - 1)
 
@@ -119,9 +134,9 @@ def roll_at_goal(problem: Problem, candidate: Candidate, gain, x, dynamics: Dyna
         x = _step(slope, x, step, dynamics.large)
         return x, jnp.maximum(peak, _fill(x, limits))
 
-    x = split(x)
-    x, peak = jax.lax.fori_loop(0, round(duration / step), advance, (x, _fill(x, limits)))
-    return jnp.stack(x), peak
+    start = split(x)
+    ends, peak = jax.lax.fori_loop(0, round(duration / step), advance, (start, _fill(start, limits)))
+    return jnp.stack(ends), peak
 
 
 def _feedback(gain, error):

@@ -13,6 +13,7 @@ from functools import partial
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, DTypeLike, Float
 
 from rtcd_jax.genome import decode, initial_genome
 from rtcd_jax.numerics import interior_point
@@ -71,8 +72,15 @@ def plan(problem: Problem, candidates: Candidate) -> Trajectory:
     return Trajectory(us, xs, h, best.cost, best.defect, best.iterations, status)
 
 
-def interval_map(problem: Problem, candidate: Candidate, x, u, h, substeps: int):
-    """Phi(x, u, h), elementwise over the axes behind the first."""
+def interval_map(
+    problem: Problem,
+    candidate: Candidate,
+    x: Float[Array, "n *batch"],
+    u: Float[Array, "m *batch"],
+    h: Float[Array, "*#batch"] | float,
+    substeps: int,
+) -> Float[Array, "n *batch"]:
+    """Phi(x, u, h), elementwise over the trailing axes."""
     dynamics = componentwise(partial(problem.plant.dynamics, candidate.design))
     return jnp.stack(rk4(dynamics, split(x), u, h, substeps))
 
@@ -98,7 +106,7 @@ def _better(best: interior_point.Solution, found: interior_point.Solution, tried
     return jax.tree.map(lambda new, old: jnp.where(tried & (cheaper | closer), new, old), found, best)
 
 
-def starts(problem: Problem, dtype) -> interior_point.Guess:
+def starts(problem: Problem, dtype: DTypeLike) -> interior_point.Guess:
     """The family [G ...] of guesses: swing to and fro about the start, then into the goal, in a long and a short time.
 
     Which one ends best depends on how many swings the candidate needs. They are motions, no solutions of the dynamics:

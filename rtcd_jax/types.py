@@ -1,15 +1,19 @@
-"""The nouns. Each contains the one before it; shapes are those of one candidate.
+"""The nouns. Each contains the one before it.
 
-A population is the same pytree with a leading axis P. `us` stands before `xs` because jaxtyping
-binds `N` at the first annotation and can evaluate `N+1` only afterwards.
+`*batch` is empty for one candidate; a population is the same pytree with a leading axis P. The tests check every shape
+below where an object is made; what `jax.vmap` and `jax.tree.map` put together is not looked at. In `Trajectory`, `us`
+stands before `xs` because jaxtyping reads in this order: it can evaluate `intervals+1` once `intervals` is bound.
 """
 
 import enum
+from collections.abc import Iterable
 from dataclasses import dataclass
+from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, Int
 
 
@@ -50,25 +54,25 @@ class Candidate(eqx.Module):
     """
 
     design: eqx.Module
-    q: Float[Array, " n"]
-    r: Float[Array, " m"]
-    policy: dict[str, Float[Array, ""]] = eqx.field(default_factory=dict)
+    q: Float[Array, "*batch n"]
+    r: Float[Array, "*batch m"]
+    policy: dict[str, Float[Array, "*batch"]] = eqx.field(default_factory=dict)
 
 
 class Trajectory(eqx.Module):
-    """A nominal motion on N intervals of equal length `dt` [s], the input held inside each interval.
+    """A nominal motion on intervals of equal length `dt` [s], the input held inside each interval.
 
     `cost` is the transcription's objective, `defect` the largest one-interval residual
     |x_{k+1} - Phi(x_k, u_k, dt)|, `iterations` those of the start that was kept.
     """
 
-    us: Float[Array, "N m"]
-    xs: Float[Array, "N+1 n"]
-    dt: Float[Array, ""]
-    cost: Float[Array, ""]
-    defect: Float[Array, ""]
-    iterations: Int[Array, ""]
-    status: Int[Array, ""]
+    us: Float[Array, "*batch intervals m"]
+    xs: Float[Array, "*batch intervals+1 n"]
+    dt: Float[Array, "*batch"]
+    cost: Float[Array, "*batch"]
+    defect: Float[Array, "*batch"]
+    iterations: Int[Array, "*batch"]
+    status: Int[Array, "*batch"]
 
 
 class Policy(eqx.Module):
@@ -78,18 +82,18 @@ class Policy(eqx.Module):
     """
 
     trajectory: Trajectory
-    gains: Float[Array, "N+1 m n"]
-    values: Float[Array, "N+1 n n"]
-    status: Int[Array, ""]
+    gains: Float[Array, "*batch knots m n"]
+    values: Float[Array, "*batch knots n n"]
+    status: Int[Array, "*batch"]
 
 
 class Funnel(eqx.Module):
     """B_k = {x : V_k(x) <= levels_k}. `trials` fresh states of B_k were rolled out without a failure."""
 
     policy: Policy
-    levels: Float[Array, " N+1"]
-    trials: Int[Array, " N+1"]
-    status: Int[Array, ""]
+    levels: Float[Array, "*batch knots"]
+    trials: Int[Array, "*batch knots"]
+    status: Int[Array, "*batch"]
 
 
 @jax.tree_util.register_pytree_with_keys_class
@@ -99,23 +103,25 @@ class Volumes:
     those of the knots as `VOLUMES` in volume.py says.
     """
 
-    per_knot: Float[Array, " N+1"]
-    named: dict[str, Float[Array, ""]]
+    per_knot: Float[Array, "*batch knots"]
+    named: dict[str, Float[Array, "*batch"]]
 
-    def __getitem__(self, name: str) -> Float[Array, ""]:
+    def __getitem__(self, name: str) -> Any:
         if name not in self.named:
             raise KeyError(f"no volume is called {name!r}; there are {', '.join(self.named)}")
         return self.named[name]
 
-    def tree_flatten_with_keys(self):
+    def tree_flatten_with_keys(self) -> tuple[list, tuple[str, ...]]:
         names = ("per_knot", *(_STORED.get(name, name) for name in self.named))
         leaves = (self.per_knot, *self.named.values())
         return [(jax.tree_util.GetAttrKey(n), leaf) for n, leaf in zip(names, leaves, strict=True)], tuple(self.named)
 
     @classmethod
-    def tree_unflatten(cls, names: tuple[str, ...], leaves) -> "Volumes":
+    def tree_unflatten(cls, names: tuple[str, ...], leaves: Iterable) -> "Volumes":
         per_knot, *others = leaves
-        return cls(per_knot, dict(zip(names, others, strict=True)))
+        volumes = object.__new__(cls)  # unchecked: JAX puts its own objects in the place of arrays
+        vars(volumes).update(per_knot=per_knot, named=dict(zip(names, others, strict=True)))
+        return volumes
 
 
 _STORED = {"sum": "total"}
@@ -125,12 +131,12 @@ _STORED = {"sum": "total"}
 class Evaluation(eqx.Module):
     """Everything that is known of one genome after one pass along the flow."""
 
-    genome: Float[Array, " d"]
+    genome: Float[Array, "*batch d"]
     candidate: Candidate
     funnel: Funnel
     volumes: Volumes
-    status: Int[Array, ""]
+    status: Int[Array, "*batch"]
 
-    def take(self, rows) -> "Evaluation":
-        """Of a population's evaluation: the candidates at `rows` [E]."""
+    def take(self, rows: Int[Array | np.ndarray, " E"]) -> "Evaluation":
+        """Of a population's evaluation: the candidates at `rows`."""
         return jax.tree.map(lambda leaf: leaf[rows], self)

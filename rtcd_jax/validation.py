@@ -16,7 +16,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from rtcd_jax import rollout
 from rtcd_jax.config.schema import FunnelConfig, GoalConfig
@@ -74,40 +74,50 @@ class Rollouts(NamedTuple):
     def intervals(self) -> int:
         return self.sets.centers.shape[1] - 1
 
-    def roll(self, tracking: rollout.TrackingData, x, dynamics: rollout.Dynamics):
-        """End states [n N ...] and peaks [N ...] of states [n N ...] after one interval each."""
+    def roll(
+        self, tracking: rollout.TrackingData, x: Float[Array, "n intervals *batch"], dynamics: rollout.Dynamics
+    ) -> tuple[Float[Array, "n intervals *batch"], Float[Array, "intervals *batch"]]:
+        """End states and peaks after one interval each."""
         return rollout.roll_intervals(self.problem, self.candidate, tracking, x, dynamics)
 
-    def interval(self, x, k, dynamics: rollout.Dynamics):
-        """States [n S] after interval `k`, and whether they stayed in the boxes till then [S]."""
+    def interval(
+        self, x: Float[Array, "n S"], k: Int[Array, ""], dynamics: rollout.Dynamics
+    ) -> tuple[Float[Array, "n S"], Bool[Array, " S"]]:
+        """States after interval `k`, and whether they stayed in the boxes till then."""
         ends, peaks = self.roll(self.tracking.part(k + np.arange(1)), x[:, None], dynamics)
         return ends[:, 0], peaks[0] <= 1
 
-    def arrive(self, x, dynamics: rollout.Dynamics):
-        """States [n S] after the horizon behind t_N, and whether they came closer to the goal, inside the boxes [S]."""
+    def arrive(
+        self, x: Float[Array, "n S"], dynamics: rollout.Dynamics
+    ) -> tuple[Float[Array, "n S"], Bool[Array, " S"]]:
+        """States after the horizon behind t_N, and whether they came closer to the goal, inside the boxes."""
         gain, goal = self.policy.gains[-1], self.goal
         ends, peaks = rollout.roll_at_goal(self.problem, self.candidate, gain, x, dynamics, goal.horizon, goal.step)
         return ends, (peaks <= 1) & (self.level(ends, self.intervals) < self.level(x, self.intervals))
 
-    def level(self, x, k):
-        """V_k [S] of states [n S] at one knot."""
+    def level(self, x: Float[Array, "n S"], k: Int[Array, ""] | int) -> Float[Array, " S"]:
+        """V_k of states at one knot."""
         return self.sets.part(k + np.arange(1)).level(x[:, None])[0]
 
-    def uniform(self, levels, born, key):
-        """States [n S], uniform in the ellipsoid of the knot [S] in which each is born."""
+    def uniform(
+        self, levels: Float[Array, " knots"], born: Int[Array | np.ndarray, " S"], key: PRNGKeyArray
+    ) -> Float[Array, "n S"]:
+        """States, each uniform in the ellipsoid of the knot in which it is born."""
         y = sampling.ball(key, born.shape, self.sets.centers.shape[0], levels.dtype)
         return self.sets.part(born).points(jnp.sqrt(levels)[born], y)
 
 
 class _Validated(NamedTuple):
-    levels: Float[Array, " K"]
-    failures: Int[Array, " K"]
+    levels: Float[Array, " knots"]
+    failures: Int[Array, " knots"]
     clean: Bool[Array, ""]
     round: Int[Array, ""]
 
 
-def validate_intervals(rollouts: Rollouts, levels, key, budget: SamplingBudget):
-    """Levels [K] and samples [K] after held-out states were rolled out over one interval each: B_k into B_{k+1}.
+def validate_intervals(
+    rollouts: Rollouts, levels: Float[Array, " knots"], key: PRNGKeyArray, budget: SamplingBudget
+) -> tuple[Float[Array, " knots"], Int[Array, " knots"]]:
+    """Levels and samples after held-out states were rolled out over one interval each: B_k into B_{k+1}.
 
     The last level keeps zero samples: no interval starts there.
     """
@@ -132,8 +142,14 @@ def validate_intervals(rollouts: Rollouts, levels, key, budget: SamplingBudget):
     return done.levels, samples.astype(jnp.int32)
 
 
-def validate_paths(rollouts: Rollouts, levels, key, budget: SamplingBudget, samples_per_knot=None):
-    """Levels [K] and samples [K] after held-out states of all knots were followed to the goal, by the closed form.
+def validate_paths(
+    rollouts: Rollouts,
+    levels: Float[Array, " knots"],
+    key: PRNGKeyArray,
+    budget: SamplingBudget,
+    samples_per_knot: Int[Array, ""] | int | None = None,
+) -> tuple[Float[Array, " knots"], Int[Array, " knots"]]:
+    """Levels and samples after held-out states of all knots were followed to the goal, by the closed form.
 
     First in rounds of `budget.funnel.trials` states a knot, which are cheap, until one is clean, then in rounds of
     `samples_per_knot` (a number or a tracer; the budget's), on which epsilon rests.
@@ -225,7 +241,7 @@ class _Pair(NamedTuple):
     place: Int[Array, " S"]
     ends: Float[Array, "2 n S"]
 
-    def seen(self, place, difference) -> "_Pair":
+    def seen(self, place: Int[Array, ""] | int, difference: Float[Array, " S"]) -> "_Pair":
         """With the states of now where they differ more than ever; a NaN differs without limit."""
         difference = jnp.where(jnp.isnan(difference), jnp.inf, difference)
         larger = difference > self.difference
@@ -236,7 +252,9 @@ class _Pair(NamedTuple):
         )
 
 
-def compare_physics(rollouts: Rollouts, levels, key, states: int, mjx: rollout.Dynamics) -> PhysicsComparison:
+def compare_physics(
+    rollouts: Rollouts, levels: Float[Array, " knots"], key: PRNGKeyArray, states: int, mjx: rollout.Dynamics
+) -> PhysicsComparison:
     """Follows `states` new states, spread evenly over the knots' ellipsoids, by the closed form and by `mjx`."""
     closed_form = rollout.closed_form(rollouts.problem.plant)
     knots = levels.shape[0]

@@ -1,14 +1,25 @@
-"""Tests run in float64 on the CPU, with a cache folder of their own."""
+"""Tests run in float64 on the CPU, with a cache folder of their own, and check the annotated shapes."""
 
 import os
 import signal
 
 import jax
 import pytest
+from jaxtyping import install_import_hook
 
-from tests.cli.terminal import in_terminal
-from tests.paths import ROOT
-from tests.run.small import Small
+CHECKED = (
+    *("types", "problem", "genome", "trajectory", "policy", "rollout", "funnel", "validation", "volume", "evaluation"),
+    "plants",
+    "numerics",
+)
+"""Modules whose annotations hold at every call: beartype reads them, jaxtyping binds the axes' names."""
+
+install_import_hook([f"rtcd_jax.{name}" for name in CHECKED], "beartype.beartype")
+
+# What imports the package comes after the hook.
+from tests.cli.terminal import in_terminal  # noqa: E402
+from tests.paths import ROOT  # noqa: E402
+from tests.run.small import Small  # noqa: E402
 
 jax.config.update("jax_enable_x64", True)
 

@@ -12,7 +12,7 @@ from scipy.integrate import solve_ivp
 from scipy.interpolate import CubicHermiteSpline
 
 from rtcd_jax.config.load import load
-from rtcd_jax.plants.pendulum import PendulumDesign
+from rtcd_jax.plants.pendulum import Pendulum, PendulumDesign
 from rtcd_jax.policy import goal_value, linearize, nominal, options, stabilize
 from rtcd_jax.problem import make_problem
 from rtcd_jax.trajectory import plan
@@ -57,7 +57,7 @@ def policies(track, candidates, planned):
     return track(candidates, planned)
 
 
-class Pendulum:
+class Linearized:
     """The linearization of candidate `row` by hand."""
 
     def __init__(self, plant, row):
@@ -87,21 +87,21 @@ def test_values_are_symmetric_positive_definite_at_every_knot(policies):
 
 def test_the_last_value_is_the_goals_algebraic_riccati_solution(problem, policies):
     for row in range(len(MASS)):
-        model = Pendulum(problem.plant, row)
+        model = Linearized(problem.plant, row)
         exact = scipy.linalg.solve_continuous_are(model.a(np.pi), model.b, np.diag(Q[row]), np.diag(R[row]))
         np.testing.assert_allclose(policies.values[row, -1], exact, rtol=1e-8)
 
 
 def test_gains_are_r_inverse_b_transposed_s(problem, policies):
     for row in range(len(MASS)):
-        b = Pendulum(problem.plant, row).b
+        b = Linearized(problem.plant, row).b
         expected = np.einsum("mn,knj->kmj", b.T / R[row], policies.values[row])
         np.testing.assert_allclose(policies.gains[row], expected, rtol=1e-12)
 
 
 def riccati_by_radau(problem, trajectory, row):
     """S(t_k) [N+1 n n] by an implicit integrator on the Hermite nominal, from scipy's algebraic solution."""
-    model, q, r_inverse = Pendulum(problem.plant, row), np.diag(Q[row]), 1 / R[row, 0]
+    model, q, r_inverse = Linearized(problem.plant, row), np.diag(Q[row]), 1 / R[row, 0]
     spread = r_inverse * model.b @ model.b.T
     xs, us, dt = (np.asarray(leaf) for leaf in (trajectory.xs, trajectory.us[:, 0], trajectory.dt))
     start_rates, end_rates = model.rate(xs[:-1], us), model.rate(xs[1:], us)
@@ -144,7 +144,7 @@ def test_the_linearization_is_the_one_by_hand(problem, candidates):
     x = jnp.asarray(np.random.default_rng(0).normal(size=(2, 5)))
     u = jnp.zeros((1, 5))
     for row in range(len(MASS)):
-        model = Pendulum(problem.plant, row)
+        model = Linearized(problem.plant, row)
         a, b = linearize(problem, take(candidates, row), x, u)
         for k in range(5):
             np.testing.assert_allclose(a[..., k], model.a(float(x[0, k])), rtol=1e-12, atol=1e-12)
@@ -159,7 +159,7 @@ def test_the_nominal_motion_meets_knots_and_nearly_solves_the_dynamics(problem, 
     np.testing.assert_array_equal(at[..., 0].T, trajectory.xs[:-1])
     np.testing.assert_array_equal(at[..., 2].T, trajectory.xs[1:])
     half = solve_ivp(
-        lambda _, x: Pendulum(problem.plant, 0).rate(x[None], float(trajectory.us[20, 0]))[0],
+        lambda _, x: Linearized(problem.plant, 0).rate(x[None], float(trajectory.us[20, 0]))[0],
         (0, float(trajectory.dt) / 2),
         trajectory.xs[20],
         rtol=1e-10,
@@ -184,20 +184,15 @@ def test_a_broken_candidate_leaves_the_others_bit_equal(track, candidates, plann
         np.testing.assert_array_equal(beside.gains[row], policies.gains[row])
 
 
-class Unactuated:
+class Unactuated(Pendulum):
     """The pendulum with a motor that is not connected: its upright rest cannot be stabilized."""
 
-    n, m = 2, 1
-
-    def __init__(self, plant):
-        self.plant = plant
-
     def dynamics(self, design, x, u):
-        return self.plant.dynamics(design, x, 0 * u)
+        return super().dynamics(design, x, 0 * u)
 
 
 def test_what_cannot_be_stabilized_is_indefinite(problem, candidates, planned):
-    loose = dataclasses.replace(problem, plant=Unactuated(problem.plant))
+    loose = dataclasses.replace(problem, plant=Unactuated())
     policy = jax.jit(partial(stabilize, loose))(take(candidates, 0), take(planned, 0))
     assert policy.status == Status.RICCATI_INDEFINITE
 

@@ -7,42 +7,37 @@ line below is one SIMD operation over all problems, and no problem's result depe
 from collections.abc import Iterable
 from typing import cast
 
-import jax
 import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
 
 
-def _total(terms: Iterable[jax.Array]) -> jax.Array:
-    """The sum of one term or more."""
-    return cast(jax.Array, sum(terms))
+def mm(a: Float[Array, "i k *#P"], b: Float[Array, "k j *#P"]) -> Float[Array, "i j *#P"]:
+    """A B."""
+    return _sum(a[:, k, None] * b[None, k] for k in range(a.shape[1]))
 
 
-def mm(a, b) -> jax.Array:
-    """A B for [i k P] and [k j P]."""
-    return _total(a[:, k, None] * b[None, k] for k in range(a.shape[1]))
+def mtm(a: Float[Array, "k i *#P"], b: Float[Array, "k j *#P"]) -> Float[Array, "i j *#P"]:
+    """A' B."""
+    return _sum(a[k, :, None] * b[k, None, :] for k in range(a.shape[0]))
 
 
-def mtm(a, b) -> jax.Array:
-    """A' B for [k i P] and [k j P]."""
-    return _total(a[k, :, None] * b[k, None, :] for k in range(a.shape[0]))
+def mv(a: Float[Array, "i k *#P"], v: Float[Array, "k *#P"]) -> Float[Array, "i *#P"]:
+    """A v."""
+    return _sum(a[:, k] * v[k] for k in range(a.shape[1]))
 
 
-def mv(a, v) -> jax.Array:
-    """A v for [i k P] and [k P]."""
-    return _total(a[:, k] * v[k] for k in range(a.shape[1]))
+def mtv(a: Float[Array, "k i *#P"], v: Float[Array, "k *#P"]) -> Float[Array, "i *#P"]:
+    """A' v."""
+    return _sum(a[k] * v[k] for k in range(a.shape[0]))
 
 
-def mtv(a, v) -> jax.Array:
-    """A' v for [k i P] and [k P]."""
-    return _total(a[k] * v[k] for k in range(a.shape[0]))
-
-
-def transpose(a):
-    """A' for [i k ...]."""
+def transpose(a: Float[Array, "i k *P"]) -> Float[Array, "k i *P"]:
+    """A'."""
     return jnp.swapaxes(a, 0, 1)
 
 
-def cholesky(a, floor=0.0):
-    """Lower factor L [n n P] with A = L L', and a flag [P] that is false where a pivot fell to `floor` or below.
+def cholesky(a: Float[Array, "n n *P"], floor: float = 0.0) -> tuple[Float[Array, "n n *P"], Bool[Array, "*P"]]:
+    """Lower factor L with A = L L', and a flag that is false where a pivot fell to `floor` or below.
 
     L is finite but meaningless there.
     """
@@ -59,24 +54,31 @@ def cholesky(a, floor=0.0):
     return jnp.stack([jnp.stack(row) for row in factor]), positive
 
 
-def solve_lower(factor, b):
-    """L^-1 B for lower L [n n P], B [n j P]."""
+def solve_lower(factor: Float[Array, "n n *#P"], b: Float[Array, "n j *#P"]) -> Float[Array, "n j *#P"]:
+    """L^-1 B for lower L."""
     rows = []
     for i in range(factor.shape[0]):
         rows.append((b[i] - sum(factor[i, k] * rows[k] for k in range(i))) / factor[i, i])
     return jnp.stack(rows)
 
 
-def solve_lower_transposed(factor, b):
-    """L'^-1 B for lower L [n n P], B [n j P]."""
+def solve_lower_transposed(factor: Float[Array, "n n *#P"], b: Float[Array, "n j *#P"]) -> Float[Array, "n j *#P"]:
+    """L'^-1 B for lower L."""
     n = factor.shape[0]
-    rows = [None] * n
+    rows: list = [None] * n
     for i in reversed(range(n)):
         rows[i] = (b[i] - sum(factor[k, i] * rows[k] for k in range(i + 1, n))) / factor[i, i]
     return jnp.stack(rows)
 
 
-def spd_solve(a, b, floor=1e-12):
-    """A^-1 B for symmetric positive definite A [n n P], B [n j P]; the flag is that of `cholesky`."""
+def spd_solve(
+    a: Float[Array, "n n *#P"], b: Float[Array, "n j *#P"], floor: float = 1e-12
+) -> tuple[Float[Array, "n j *#P"], Bool[Array, "*#P"]]:
+    """A^-1 B for symmetric positive definite A; the flag is that of `cholesky`."""
     factor, positive = cholesky(a, floor)
     return solve_lower_transposed(factor, solve_lower(factor, b)), positive
+
+
+def _sum(terms: Iterable[Array]) -> Array:
+    """The sum of one or more terms."""
+    return cast(Array, sum(terms))

@@ -10,6 +10,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax.extend.core import Literal, jaxpr_as_fun
+from jaxtyping import PyTree
 
 Entry = jax.Array | float
 Row = list[Entry]
@@ -35,13 +36,13 @@ def dot(a: Iterable[Entry], b: Iterable[Entry]) -> Entry:
     return plus(*(times(x, y) for x, y in zip(a, b, strict=True)))
 
 
-def held(entries):
+def held(entries: PyTree) -> PyTree:
     """The same entries, computed once: the compiler repeats a fused computation wherever its result is used."""
     arrays, numbers = eqx.partition(entries, eqx.is_array)
     return eqx.combine(jax.lax.optimization_barrier(arrays), numbers)
 
 
-def known(f: Callable, *args) -> list[float | None]:
+def known(f: Callable, *args: PyTree) -> list[float | None]:
     """For every output of f, its value if it does not depend on the arguments, else None.
 
     `args` are pytrees of scalars or of their shapes. An output depends on what any operation before it depends on.

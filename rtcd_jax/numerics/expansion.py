@@ -15,8 +15,9 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import PyTree
 
-from rtcd_jax.numerics.entries import Matrix, Row, dot, held, known, plus, times, unstacked
+from rtcd_jax.numerics.entries import Entry, Matrix, Row, dot, held, known, plus, times, unstacked
 
 WEIGHTS = (1 / 6, 1 / 3, 1 / 3, 1 / 6)
 REACH = (0.0, 0.5, 0.5, 1.0)
@@ -35,7 +36,7 @@ class Expansion(NamedTuple):
 class Differentiated:
     """f(x, u, parameters) on tuples of components with its first and second derivatives, known numbers folded."""
 
-    def __init__(self, f: Callable, n: int, m: int, parameters):
+    def __init__(self, f: Callable, n: int, m: int, parameters: PyTree):
         self.n, self.f = n, lambda z, p: f(z[:n], z[n:], p)
         p = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape[:-1], leaf.dtype), parameters)
         one = jax.ShapeDtypeStruct((), jax.tree.leaves(parameters)[0].dtype)
@@ -44,11 +45,11 @@ class Differentiated:
         self.known_slopes = known(self._slopes, z, p)
         self.known_curvature = known(self._curvature, z, weights, p)
 
-    def slopes(self, z, p) -> Matrix:
+    def slopes(self, z: tuple[Entry, ...], p: PyTree) -> Matrix:
         """df_i/dz_j."""
         return _fold(self._slopes(z, p), self.known_slopes)
 
-    def curvature(self, z, weights, p) -> Matrix:
+    def curvature(self, z: tuple[Entry, ...], weights: tuple[Entry, ...], p: PyTree) -> Matrix:
         """The second derivatives of weights' f."""
         return _fold(self._curvature(z, weights, p), self.known_curvature)
 
@@ -56,7 +57,7 @@ class Differentiated:
         columns = _partials(lambda z: self.f(z, p), z)
         return [list(row) for row in zip(*columns, strict=True)]
 
-    def _curvature(self, z, weights, p) -> Matrix:
+    def _curvature(self, z, weights, p) -> list[tuple[Entry, ...]]:
         def gradient(z):
             total, pull = jax.vjp(lambda z: sum(w * f for w, f in zip(weights, self.f(z, p), strict=True)), z)
             return pull(jnp.ones_like(total))[0]
@@ -78,7 +79,7 @@ def _fold(matrix, numbers) -> Matrix:
     return [[e if (number := next(numbers)) is None else number for e in row] for row in matrix]
 
 
-def expander(rate: Callable, running: Callable, n: int, m: int, parameters) -> Callable:
+def expander(rate: Callable, running: Callable, n: int, m: int, parameters: PyTree) -> Callable:
     """`expand(x, u, h, multipliers, parameters) -> Expansion` of one step, for tuples of components.
 
     The batch is the last axis of every parameter. `rate(x, u, parameters)` is f, as an array or a tuple; the step costs

@@ -1,7 +1,9 @@
 """Cubic Hermite interpolation of arrays, JAX's or numpy's."""
 
+from typing import Any
 
-def cubic_hermite(s, duration, start, start_rate, end, end_rate):
+
+def cubic_hermite(s: Any, duration: Any, start: Any, start_rate: Any, end: Any, end_rate: Any) -> Any:
     """The cubic through both ends' values and rates at the fraction s of the interval, elementwise."""
     s2, s3 = s * s, s * s * s
     return (
@@ -12,7 +14,7 @@ def cubic_hermite(s, duration, start, start_rate, end, end_rate):
     )
 
 
-def cubic_hermite_rate(s, duration, start, start_rate, end, end_rate):
+def cubic_hermite_rate(s: Any, duration: Any, start: Any, start_rate: Any, end: Any, end_rate: Any) -> Any:
     """The time derivative of that cubic."""
     rest = 1 - s
     return 6 * s * rest * (end - start) / duration + rest * (1 - 3 * s) * start_rate + s * (3 * s - 2) * end_rate

@@ -8,13 +8,14 @@ from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array, ArrayLike, Float, PyTree
 
 START, MIDDLE, END = 0, 1, 2
 """Where in the step a slope is taken."""
 
 
-def split(x):
-    """The components of x [n ...] as a tuple of n arrays [...]."""
+def split(x: Float[Array, "n *batch"]) -> tuple[Float[Array, "*batch"], ...]:
+    """The components of x."""
     return tuple(x[i] for i in range(x.shape[0]))
 
 
@@ -23,7 +24,7 @@ def componentwise(f: Callable) -> Callable:
     return lambda parts, *rest: split(f(jnp.stack(parts), *rest))
 
 
-def rk4_varying_step(slope: Callable, x, dt):
+def rk4_varying_step(slope: Callable, x: PyTree[ArrayLike], dt: ArrayLike) -> PyTree[ArrayLike]:
     """x(t + dt) for x' = slope(x, place), `place` being START, MIDDLE or END of the step."""
     k1 = slope(x, START)
     k2 = slope(_along(x, 0.5 * dt, k1), MIDDLE)
@@ -32,12 +33,12 @@ def rk4_varying_step(slope: Callable, x, dt):
     return jax.tree.map(lambda x, a, b, c, d: x + dt / 6 * (a + 2 * b + 2 * c + d), x, k1, k2, k3, k4)
 
 
-def rk4_step(f: Callable, x, u, dt):
+def rk4_step(f: Callable, x: PyTree[ArrayLike], u: PyTree[ArrayLike], dt: ArrayLike) -> PyTree[ArrayLike]:
     """x(t + dt) for x' = f(x, u), the input held."""
     return rk4_varying_step(lambda x, _: f(x, u), x, dt)
 
 
-def rk4(f: Callable, x, u, duration, steps: int):
+def rk4(f: Callable, x: PyTree[ArrayLike], u: PyTree[ArrayLike], duration: ArrayLike, steps: int) -> PyTree[ArrayLike]:
     """x(t + duration) by equal Runge-Kutta steps, the input held."""
     for _ in range(steps):
         x = rk4_step(f, x, u, duration / steps)

@@ -9,11 +9,18 @@ from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array, Int, PyTree
 
 
 def solve_in_lanes(
-    load: Callable, advance: Callable, finished: Callable, extract: Callable, count: int, width: int, wanted=None
-):
+    load: Callable,
+    advance: Callable,
+    finished: Callable,
+    extract: Callable,
+    count: int,
+    width: int,
+    wanted: Int[Array, ""] | int | None = None,
+) -> PyTree:
     """Results of problems 0 .. count-1, batch on the last axis of every leaf; of the first `wanted`, else zeros.
 
     `load(indices [W]) -> state`, `advance(state) -> state` (must leave finished lanes unchanged),

@@ -11,10 +11,11 @@ import math
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import PyTree
 
 _TARGET: ContextVar[str | None] = ContextVar("target", default=None)
 
@@ -34,19 +35,26 @@ def on_gpu() -> bool:
     return (_TARGET.get() or jax.default_backend()) in ("gpu", "cuda", "rocm")
 
 
-def short_scan(f: Callable, init, xs=None, length: int | None = None):
+def short_scan(f: Callable, init: PyTree, xs: PyTree = None, length: int | None = None) -> tuple[PyTree, PyTree]:
     """`jax.lax.scan` over a few steps: a loop on a CPU, written out on a GPU."""
     return jax.lax.scan(f, init, xs, length=length, unroll=on_gpu() or 1)
 
 
-def repeat(times: int, f: Callable, init):
+def repeat(times: int, f: Callable, init: PyTree) -> PyTree:
     """f(f(… init)), a few times: a loop on a CPU, written out on a GPU."""
     return short_scan(lambda carry, _: (f(carry), None), init, length=times)[0]
 
 
 def packed_scan(
-    f: Callable, init, xs, *, shared: int = 0, unroll: int = 1, reverse: bool = False, carry: bool = True
-) -> tuple[Any, Any]:
+    f: Callable,
+    init: PyTree,
+    xs: PyTree,
+    *,
+    shared: int = 0,
+    unroll: int = 1,
+    reverse: bool = False,
+    carry: bool = True,
+) -> tuple[PyTree, PyTree]:
     """`jax.lax.scan`; on a GPU with one array each for a step's inputs, its outputs and, if wanted, the carry.
 
     A scan reads and writes every leaf by an operation of its own, which no CUDA graph takes in. The last `shared` axes

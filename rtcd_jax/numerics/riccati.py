@@ -17,7 +17,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, ArrayLike, Bool, Float
 
 from rtcd_jax.numerics.batched import cholesky, mm, mtm, solve_lower, transpose
 
@@ -61,14 +61,21 @@ def compose(early: Interval, late: Interval) -> Interval:
     )
 
 
-def propagate(interval: Interval, value):
+def propagate(
+    interval: Interval, value: Float[Array, "n n *batch"]
+) -> tuple[Float[Array, "n n *batch"], Bool[Array, "*batch"]]:
     """S at the interval's start from S at its end, and whether it stayed positive definite."""
     damped, definite = _damped(value, interval.spread)
     before = interval.cost + mtm(interval.transition, mm(damped, interval.transition))
     return _symmetric(before), definite & interval.definite
 
 
-def short_interval(a, spread, cost, duration) -> Interval:
+def short_interval(
+    a: Float[Array, "n n *batch"],
+    spread: Float[Array, "n n *batch"],
+    cost: Float[Array, "n n *batch"],
+    duration: Float[ArrayLike, "*#batch"],
+) -> Interval:
     """The flow of constant A, G, Q over a `duration` short against the system's fastest mode.
 
     Taylor series of the interval's own Riccati equations to the third order in `duration`.
@@ -91,7 +98,13 @@ def short_interval(a, spread, cost, duration) -> Interval:
     )
 
 
-def constant_interval(a, spread, cost, duration, doublings: int) -> Interval:
+def constant_interval(
+    a: Float[Array, "n n *batch"],
+    spread: Float[Array, "n n *batch"],
+    cost: Float[Array, "n n *batch"],
+    duration: Float[ArrayLike, "*#batch"],
+    doublings: int,
+) -> Interval:
     """The flow of constant A, G, Q over `duration`, from 2^doublings equal short intervals."""
     return _double(short_interval(a, spread, cost, duration / 2**doublings), doublings)
 
@@ -100,7 +113,12 @@ def _double(interval: Interval, times: int) -> Interval:
     return jax.lax.fori_loop(0, times, lambda _, interval: compose(interval, interval), interval)
 
 
-def infinite_horizon(a, spread, cost, doublings: int = 48):
+def infinite_horizon(
+    a: Float[Array, "n n *batch"],
+    spread: Float[Array, "n n *batch"],
+    cost: Float[Array, "n n *batch"],
+    doublings: int = 48,
+) -> tuple[Float[Array, "n n *batch"], Bool[Array, "*batch"]]:
     """The stabilizing solution of the algebraic equation A'S + S A - S G S + Q = 0, and whether it was reached.
 
     The horizon doubles until further time changes nothing: convergence is quadratic for stabilizable (A, B), Q > 0.

@@ -3,10 +3,11 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, DTypeLike, Float, PRNGKeyArray
 
 
-def quasi_uniform(key, count: int, dimensions: int, dtype):
-    """`count` points [d count] of the unit cube: an additive recurrence, shifted at random.
+def quasi_uniform(key: PRNGKeyArray, count: int, dimensions: int, dtype: DTypeLike) -> Float[Array, "dimensions count"]:
+    """`count` points of the unit cube: an additive recurrence, shifted at random.
 
     The generators are powers of the root of g^(d+1) = g + 1 (Roberts 2018), the golden ratio for d = 1.
     """
@@ -18,8 +19,8 @@ def quasi_uniform(key, count: int, dimensions: int, dtype):
     return (jnp.asarray(points, dtype) + jax.random.uniform(key, (dimensions, 1), dtype)) % 1.0
 
 
-def directions(key, count: int, n: int, dtype):
-    """`count` well spread unit vectors [n count]; evenly spaced for n = 2; for n = 1 three of them point both ways."""
+def directions(key: PRNGKeyArray, count: int, n: int, dtype: DTypeLike) -> Float[Array, "n count"]:
+    """`count` well spread unit vectors; evenly spaced for n = 2; for n = 1 three of them point both ways."""
     if n == 2:
         turn = 2 * np.pi * (jnp.arange(count, dtype=dtype) + jax.random.uniform(key, (), dtype)) / count
         return jnp.stack([jnp.cos(turn), jnp.sin(turn)])
@@ -28,8 +29,8 @@ def directions(key, count: int, n: int, dtype):
     return normal / jnp.linalg.norm(normal, axis=0)
 
 
-def ball(key, shape: tuple[int, ...], n: int, dtype):
-    """Independent points [n *shape], uniform in the unit ball."""
+def ball(key: PRNGKeyArray, shape: tuple[int, ...], n: int, dtype: DTypeLike) -> Float[Array, "n *shape"]:
+    """Independent points, uniform in the unit ball."""
     aim, reach = jax.random.split(key)
     normal = jax.random.normal(aim, (n, *shape), dtype)
     radius = jax.random.uniform(reach, shape, dtype) ** (1 / n)

@@ -4,6 +4,7 @@ from collections.abc import Callable
 
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Float
 
 from rtcd_jax.numerics.batched import mtm, mtv, mv, spd_solve
 from rtcd_jax.numerics.derivatives import value_and_jacobian
@@ -15,8 +16,8 @@ PULLS = np.array([0.01, 0.1, 1.0])
 BISECTIONS = 14
 
 
-def climb(f: Callable, y, steps: int):
-    """Unit vectors [n ...] from which |f|^2 is at least as large as from `y`, for f elementwise behind the first axis.
+def climb(f: Callable, y: Float[Array, "n *batch"], steps: int) -> Float[Array, "n *batch"]:
+    """Unit vectors from which |f|^2 is at least as large as from `y`, for f elementwise over the trailing axes.
 
     Each step goes to the maximum of |f(y) + J (z - y)|^2 on the sphere, drawn back to `y` more or less, whichever is
     best: where f saturates, the model's own maximum is often none of f.

@@ -8,6 +8,9 @@ from typing import ClassVar
 import equinox as eqx
 from jaxtyping import Array, Float
 
+Components = tuple[Float[Array, "*batch"], ...]
+"""The rows of a state or an input, not stacked to one array: programs of single numbers keep them apart."""
+
 ModelEdits = Mapping[str, Float[Array, "..."] | Mapping[str, Float[Array, "..."]]]
 
 
@@ -43,15 +46,17 @@ class Plant(eqx.Module):
         """Largest |u_i| of every input, in `input_units`."""
 
     @abc.abstractmethod
-    def dynamics(self, design, x: Float[Array, " n"], u: Float[Array, " m"]) -> Float[Array, " n"]:
-        """State derivative in SI units per second. `design` may carry any broadcastable leaves."""
+    def dynamics(
+        self, design: eqx.Module, x: Float[Array, "n *batch"] | Components, u: Float[Array, "m *batch"] | Components
+    ) -> Float[Array, "n *batch"]:
+        """State derivative in SI units per second; the design's leaves are broadcast to the states' trailing axes."""
 
     @abc.abstractmethod
-    def energy(self, design, x: Float[Array, " n"]) -> Float[Array, ""]:
+    def energy(self, design: eqx.Module, x: Float[Array, "n *batch"]) -> Float[Array, "*batch"]:
         """Mechanical energy [J]; for u = 0 its rate is the power lost in the dampers."""
 
     @abc.abstractmethod
-    def parameters(self, design) -> dict[str, float]:
+    def parameters(self, design: eqx.Module) -> dict[str, float]:
         """Every physical number of this robot by name, design included, in SI units."""
 
     @classmethod
@@ -64,7 +69,7 @@ class Plant(eqx.Module):
         """
 
     @abc.abstractmethod
-    def edit_model(self, design) -> ModelEdits:
+    def edit_model(self, design: eqx.Module) -> ModelEdits:
         """What `design` and the constants replace in the MuJoCo model that `mjcf` compiles to.
 
         Keyed by the model's attribute. The value is the whole attribute ("opt.gravity"), or its rows by

@@ -19,7 +19,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from rtcd_jax.numerics.trigonometry import cos, sin
-from rtcd_jax.plants.base import ModelEdits, Plant
+from rtcd_jax.plants.base import Components, ModelEdits, Plant
 from rtcd_jax.system.errors import UserError
 
 MEASURED_INERTIA = 0.004359984
@@ -36,8 +36,8 @@ Inertia = Literal["rod", "measured"]
 class CartpoleDesign(eqx.Module):
     """pole_length [m] from the pivot to the pole's center of mass, pole_mass [kg]."""
 
-    pole_length: Float[Array, ""]
-    pole_mass: Float[Array, ""]
+    pole_length: Float[Array, "*batch"]
+    pole_mass: Float[Array, "*batch"]
 
 
 @final
@@ -75,7 +75,9 @@ class Cartpole(Plant):
     def input_limit(self) -> tuple[float, ...]:
         return (self.force_limit,)
 
-    def dynamics(self, design: CartpoleDesign, x: Float[Array, "4"], u: Float[Array, "1"]) -> Float[Array, "4"]:
+    def dynamics(
+        self, design: CartpoleDesign, x: Float[Array, "4 *batch"] | Components, u: Float[Array, "1 *batch"] | Components
+    ) -> Float[Array, "4 *batch"]:
         moment, inertia = self._about_pivot(design)
         lever = moment / inertia
         s, c = sin(x[1]), cos(x[1])
@@ -85,7 +87,7 @@ class Cartpole(Plant):
         cart = force / (self.cart_mass + design.pole_mass - moment * lever * (c * c))
         return jnp.stack([x[2], x[3], cart, pole + lever * (c * cart)])
 
-    def energy(self, design: CartpoleDesign, x: Float[Array, "4"]) -> Float[Array, ""]:
+    def energy(self, design: CartpoleDesign, x: Float[Array, "4 *batch"]) -> Float[Array, "*batch"]:
         moment, inertia = self._about_pivot(design)
         c = cos(x[1])
         translation = 0.5 * (self.cart_mass + design.pole_mass) * x[2] ** 2 - moment * c * x[2] * x[3]
@@ -129,17 +131,17 @@ class Cartpole(Plant):
             "geom_size": {"pole": jnp.stack([radius, design.pole_length, 0 * radius])},
         }
 
-    def _about_center(self, design: CartpoleDesign):
+    def _about_center(self, design: CartpoleDesign) -> Float[Array, "*batch"]:
         """I [kg m^2]."""
         if self.inertia == "measured":
             return jnp.full_like(design.pole_length, MEASURED_INERTIA)
         return design.pole_mass * design.pole_length**2 / 3
 
-    def _about_pivot(self, design: CartpoleDesign):
+    def _about_pivot(self, design: CartpoleDesign) -> tuple[Float[Array, "*batch"], Float[Array, "*batch"]]:
         """First moment Mp lp [kg m] and inertia I + Mp lp^2 [kg m^2] of the pole."""
         moment = design.pole_mass * design.pole_length
         return moment, self._about_center(design) + moment * design.pole_length
 
 
-def _upward(height: Float[Array, ""]) -> Float[Array, "3"]:
+def _upward(height: Float[Array, "*batch"]) -> Float[Array, "3 *batch"]:
     return jnp.stack([jnp.zeros_like(height), jnp.zeros_like(height), height])

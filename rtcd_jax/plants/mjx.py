@@ -127,8 +127,10 @@ class CpuDynamics:
         self._batch = Batch(model, nsim=capacity, nthread=1)
         self._fields = tuple(self._batch.bind(name) for name in ("qpos", "qvel", "ctrl", "qacc"))
 
-    def __call__(self, x: Float[np.ndarray, "states n"], u: Float[np.ndarray, "states m"]) -> np.ndarray:
-        """(qvel, qacc) [states n] for at most `capacity` states."""
+    def __call__(
+        self, x: Float[np.ndarray, "states n"], u: Float[np.ndarray, "states m"]
+    ) -> Float[np.ndarray, "states n"]:
+        """(qvel, qacc) for at most `capacity` states."""
         states = len(x)
         qpos, qvel, ctrl, qacc = (field[:states] for field in self._fields)
         qpos[:], qvel[:] = np.split(x, 2, axis=1)

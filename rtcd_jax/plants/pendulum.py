@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from rtcd_jax.numerics.trigonometry import cos, sin
-from rtcd_jax.plants.base import ModelEdits, Plant
+from rtcd_jax.plants.base import Components, ModelEdits, Plant
 
 _ROD_RADIUS = 0.008  # [m], as drawn in pendulum.xml
 
@@ -21,8 +21,8 @@ _ROD_RADIUS = 0.008  # [m], as drawn in pendulum.xml
 class PendulumDesign(eqx.Module):
     """mass [kg] of the bob, length [m] from the pivot to it."""
 
-    mass: Float[Array, ""]
-    length: Float[Array, ""]
+    mass: Float[Array, "*batch"]
+    length: Float[Array, "*batch"]
 
 
 @final
@@ -50,12 +50,14 @@ class Pendulum(Plant):
     def input_limit(self) -> tuple[float, ...]:
         return (self.torque_limit,)
 
-    def dynamics(self, design: PendulumDesign, x: Float[Array, "2"], u: Float[Array, "1"]) -> Float[Array, "2"]:
+    def dynamics(
+        self, design: PendulumDesign, x: Float[Array, "2 *batch"] | Components, u: Float[Array, "1 *batch"] | Components
+    ) -> Float[Array, "2 *batch"]:
         inertia = design.mass * design.length**2
         weight = design.mass * self.gravity * design.length * sin(x[0])
         return jnp.stack([x[1], (u[0] - self.damping * x[1] - weight) / inertia])
 
-    def energy(self, design: PendulumDesign, x: Float[Array, "2"]) -> Float[Array, ""]:
+    def energy(self, design: PendulumDesign, x: Float[Array, "2 *batch"]) -> Float[Array, "*batch"]:
         speed = design.length * x[1]
         height = design.length * (1 - cos(x[0]))
         return design.mass * (0.5 * speed**2 + self.gravity * height)
@@ -87,5 +89,5 @@ class Pendulum(Plant):
         }
 
 
-def _downward(length: Float[Array, ""]) -> Float[Array, "3"]:
+def _downward(length: Float[Array, "*batch"]) -> Float[Array, "3 *batch"]:
     return jnp.stack([jnp.zeros_like(length), jnp.zeros_like(length), -length])

@@ -11,12 +11,12 @@ BATCH = 7
 
 
 def random(*shape, seed=0):
-    return np.random.default_rng(seed).normal(size=(*shape, BATCH))
+    return jnp.asarray(np.random.default_rng(seed).normal(size=(*shape, BATCH)))
 
 
 def positive_definite(n):
     root = random(n, n, seed=n)
-    return np.einsum("ikp,jkp->ijp", root, root) + 0.1 * np.eye(n)[:, :, None]
+    return jnp.einsum("ikp,jkp->ijp", root, root) + 0.1 * np.eye(n)[:, :, None]
 
 
 @pytest.mark.parametrize(
@@ -77,8 +77,7 @@ def test_a_pivot_at_the_floor_is_refused():
 @pytest.mark.parametrize("bad", [np.nan, -1.0])
 def test_a_bad_problem_leaves_the_others_bit_equal(bad):
     a, b = positive_definite(3), random(3, 2)
-    spoilt = a.copy()
-    spoilt[1, 1, 4] = bad
+    spoilt = a.at[1, 1, 4].set(bad)
     solve = jax.jit(batched.spd_solve)
     solution, positive = solve(a, b)
     solution_beside, positive_beside = solve(spoilt, b)

@@ -18,7 +18,7 @@ def random_ellipsoid(n, count=3):
 @pytest.mark.parametrize("n", [1, 2, 4])
 def test_points_of_the_ball_land_on_their_level(n):
     matrix, factor = random_ellipsoid(n)
-    y = np.random.default_rng(0).normal(size=(n, 3))
+    y = jnp.asarray(np.random.default_rng(0).normal(size=(n, 3)))
     x = ellipsoid.from_ball(factor, y)
     levels = np.einsum("ip,ijp,jp->p", x, matrix, x)
     np.testing.assert_allclose(levels, np.sum(y**2, 0), rtol=1e-11)
@@ -27,7 +27,7 @@ def test_points_of_the_ball_land_on_their_level(n):
 @pytest.mark.parametrize(("n", "unit_ball"), [(1, 2), (2, np.pi), (3, 4 * np.pi / 3), (4, np.pi**2 / 2)])
 def test_volume_is_the_unit_balls_times_the_half_axes(n, unit_ball):
     matrix, factor = random_ellipsoid(n)
-    level = np.array([0.3, 1.0, 7.0])
+    level = jnp.array([0.3, 1.0, 7.0])
     eigenvalues = np.linalg.eigvalsh(np.moveaxis(matrix, -1, 0))
     half_axes = np.sqrt(level[:, None] / eigenvalues)
     expected = np.log(unit_ball) + np.sum(np.log(half_axes), -1)
@@ -40,7 +40,7 @@ def test_volume_is_the_share_of_a_box_that_is_inside():
     widths = ellipsoid.half_widths(factor)
     x = widths * np.random.default_rng(1).uniform(-1, 1, (2, 400_000))
     share = np.mean(np.einsum("ip,ij,jp->p", x, matrix[..., 0], x) <= 1)
-    volume = np.exp(ellipsoid.log_volume(factor, 1.0))
+    volume = np.exp(ellipsoid.log_volume(factor, jnp.ones(1)))
     np.testing.assert_allclose(volume / np.prod(2 * widths), share, atol=4 * 0.0008)
 
 
@@ -56,8 +56,8 @@ def test_half_widths_are_reached_and_never_passed(n):
     inverse = np.linalg.inv(np.moveaxis(matrix, -1, 0))
     widths = ellipsoid.half_widths(factor)
     np.testing.assert_allclose(widths.T, np.sqrt(np.diagonal(inverse, axis1=1, axis2=2)), rtol=1e-10)
-    unit = np.random.default_rng(0).normal(size=(n, 5000, 1))
-    inside = ellipsoid.from_ball(factor[:, :, None], unit / np.linalg.norm(unit, axis=0))
+    unit = jnp.asarray(np.random.default_rng(0).normal(size=(n, 5000, 1)))
+    inside = ellipsoid.from_ball(factor[:, :, None], unit / jnp.linalg.norm(unit, axis=0))
     assert np.all(np.abs(inside) <= widths[:, None])
 
 
@@ -70,8 +70,8 @@ def random_row(n, count=4):
 def test_points_of_a_row_lie_on_the_levels_they_were_asked_for():
     row = random_row(3)
     random = np.random.default_rng(0)
-    radii = random.uniform(0, 2, (4, 5, 6))
-    y = random.normal(size=(3, 1, 1, 6))
+    radii = jnp.asarray(random.uniform(0, 2, (4, 5, 6)))
+    y = jnp.asarray(random.normal(size=(3, 1, 1, 6)))
     x = row.points(radii, y)
     assert x.shape == (3, 4, 5, 6)
     np.testing.assert_allclose(row.level(x), radii**2 * np.sum(y**2, 0), rtol=1e-10, atol=1e-12)
@@ -85,24 +85,24 @@ def test_the_way_to_the_ball_is_the_way_back_from_it(n):
     """points(radii, y) -> radii y, and |y|^2 = V of any x."""
     row = random_row(n)
     random = np.random.default_rng(0)
-    radii = random.uniform(0.1, 2, (4, 5, 6))
-    y = random.normal(size=(n, 4, 5, 6))
+    radii = jnp.asarray(random.uniform(0.1, 2, (4, 5, 6)))
+    y = jnp.asarray(random.normal(size=(n, 4, 5, 6)))
     np.testing.assert_allclose(row.to_ball(row.points(radii, y)), radii * y, rtol=1e-9, atol=1e-10)
-    x = random.normal(size=(n, 4, 7))
+    x = jnp.asarray(random.normal(size=(n, 4, 7)))
     np.testing.assert_allclose(np.sum(row.to_ball(x) ** 2, 0), row.level(x), rtol=1e-10)
     np.testing.assert_array_equal(row.to_ball(row.centers), 0)
 
 
 def test_a_part_is_the_row_cut():
     row = random_row(2)
-    radii, aim = np.array([0.5, 1.5]), np.array([[0.6], [-0.8]])
+    radii, aim = jnp.array([0.5, 1.5]), jnp.array([[0.6], [-0.8]])
     points = row.part(slice(1, 3)).points(radii, aim)
-    whole = row.points(np.array([9.0, 0.5, 1.5, 9.0]), aim)
+    whole = row.points(jnp.array([9.0, 0.5, 1.5, 9.0]), aim)
     np.testing.assert_array_equal(points, whole[:, 1:3])
 
 
 def test_the_largest_set_inside_the_box_touches_it_and_no_more():
-    row, limits = random_row(3), np.array([2.5, 3.0, 3.5])
+    row, limits = random_row(3), jnp.array([2.5, 3.0, 3.5])
     radii = row.radii_inside(limits)
     assert np.all(radii > 0)
     reach = np.abs(row.centers) + radii * ellipsoid.half_widths(row.factors)
@@ -111,7 +111,7 @@ def test_the_largest_set_inside_the_box_touches_it_and_no_more():
 
 def test_no_set_is_inside_a_box_without_its_center():
     row = random_row(2)
-    outside = np.max(np.abs(row.centers), 1) * 0.99
+    outside = jnp.max(jnp.abs(row.centers), 1) * 0.99
     radii = row.radii_inside(outside)
     beyond = np.any(np.abs(row.centers) > outside[:, None], 0)
     assert np.any(beyond)

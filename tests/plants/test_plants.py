@@ -37,9 +37,9 @@ def test_energy_is_mujocos_up_to_a_constant(robot):
         return data.energy.sum()
 
     for index in range(3):
-        design, model, x = robot.design(index), robot.recompiled(index), np.asarray(robot.x[index])
-        ours = robot.plant.energy(design, x) - robot.plant.energy(design, np.zeros_like(x))
-        theirs = mujoco_energy(model, x) - mujoco_energy(model, np.zeros_like(x))
+        design, model, x = robot.design(index), robot.recompiled(index), robot.x[index]
+        ours = robot.plant.energy(design, x) - robot.plant.energy(design, 0 * x)
+        theirs = mujoco_energy(model, x) - mujoco_energy(model, 0 * x)
         np.testing.assert_allclose(ours, theirs, rtol=1e-9)
 
 
@@ -84,7 +84,7 @@ def test_every_design_variable_moves_the_robot(robot):
 
 def test_pendulum_balances_at_the_torque_of_its_weight():
     plant, design = plant_class("pendulum").from_parameters(
-        {"m": 0.7, "l": 0.4, "b": 0.1, "g": 9.81, "torque_limit": 2}
+        {"m": 0.7, "l": 0.4, "b": 0.1, "g": 9.81, "torque_limit": 2.0}
     )
     at_rest = plant.dynamics(design, jnp.array([jnp.pi / 2, 0.0]), jnp.array([0.7 * 9.81 * 0.4]))
     np.testing.assert_allclose(at_rest, 0, atol=1e-14)

@@ -10,7 +10,7 @@ every array, see ../batched.py, and problems go through in lanes, see ../lanes.p
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Int
+from jaxtyping import Array, Int, PyTree
 
 from rtcd_jax.numerics.interior_point.boxes import largest
 from rtcd_jax.numerics.interior_point.iteration import Iteration
@@ -37,7 +37,11 @@ def _lanes(count: int, intervals: int, w: int) -> int:
 
 
 def solve(
-    problem: ControlProblem, parameters, guess: Guess, allowance: Int[Array, " P"], settings: Settings = DEFAULTS
+    problem: ControlProblem,
+    parameters: PyTree,
+    guess: Guess,
+    allowance: Int[Array, " P"],
+    settings: Settings = DEFAULTS,
 ) -> Solution:
     """Solve every problem of the batch from one guess, within `allowance` iterations.
 

@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from rtcd_jax.numerics.interior_point.boxes import Boxed
 
@@ -30,6 +30,6 @@ class Iterate(NamedTuple):
     solved: Bool[Array, " P"]
 
 
-def where(condition: Bool[Array, " P"], yes, no):
+def where(condition: Bool[Array, " P"], yes: PyTree, no: PyTree) -> PyTree:
     """`jnp.where` on every leaf of two trees."""
     return jax.tree.map(lambda a, b: jnp.where(condition, a, b), yes, no)

@@ -2,6 +2,7 @@
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from rtcd_jax.numerics import kkt
 from rtcd_jax.numerics.entries import dot, plus
@@ -27,7 +28,7 @@ class Iteration:
     def __init__(self, model: Model, settings: Settings):
         self.model, self.settings = model, settings
 
-    def initial(self, guess: Guess, parameters) -> Iterate:
+    def initial(self, guess: Guess, parameters: PyTree) -> Iterate:
         batch = guess.h.shape[-1]
         inside = jax.tree.map(push_inside, self.model.values(*guess), self.model.lower, self.model.upper)
         pinned = lambda a: jnp.broadcast_to(jnp.asarray(a, self.model.dtype)[:, None], (self.model.n, batch))  # noqa: E731
@@ -57,10 +58,10 @@ class Iteration:
             solved=jnp.zeros((batch,), bool),
         )
 
-    def finished(self, it: Iterate, allowance):
+    def finished(self, it: Iterate, allowance: Int[Array, " P"]) -> Bool[Array, " P"]:
         return it.solved | (it.iterations >= allowance)
 
-    def advance(self, it: Iterate, parameters, allowance) -> Iterate:
+    def advance(self, it: Iterate, parameters: PyTree, allowance: Int[Array, " P"]) -> Iterate:
         """One interior-point iteration; lanes that are finished come back unchanged."""
         s = self.settings
         expansion = self.model.expand(it.xs, it.us, it.h, it.multipliers, parameters)
@@ -86,7 +87,7 @@ class Iteration:
         moved = where(solved, state, moved)
         return where(self.finished(it, allowance), it, moved)
 
-    def stationarity(self, it: Iterate, expansion: Expansion):
+    def stationarity(self, it: Iterate, expansion: Expansion) -> Float[Array, " P"]:
         """Largest entry of the Lagrangian's gradient, over max(100, mean multiplier)/100: E_0 of (5)."""
         n = self.model.n
         multipliers = [it.multipliers[:, i] for i in range(n)]
@@ -103,7 +104,7 @@ class Iteration:
         mean = (total(jnp.abs(it.multipliers)) + sum_over(it.duals)) / count
         return error / (jnp.maximum(100.0, mean) / 100.0)
 
-    def update_barrier(self, it: Iterate, slacks: Boxed, error):
+    def update_barrier(self, it: Iterate, slacks: Boxed, error: Float[Array, " P"]) -> Float[Array, " P"]:
         """(7), repeated while the barrier problem is already solved well enough."""
         s, barrier = self.settings, it.barrier
         for _ in range(4):
@@ -134,7 +135,7 @@ class Iteration:
             curvature, by_step = jnp.full_like(it.h, jnp.inf), jnp.zeros_like(it.h)
         return kkt.Subproblem(hessian, gradient, expansion.jacobian, it.defects, curvature, by_step)
 
-    def move(self, it: Iterate, slacks: Boxed, subproblem: kkt.Subproblem, parameters) -> Iterate:
+    def move(self, it: Iterate, slacks: Boxed, subproblem: kkt.Subproblem, parameters: PyTree) -> Iterate:
         """Newton step, fraction to the boundary, filter line search, new regularization."""
         s, model = self.settings, self.model
         step = kkt.solve(subproblem)
@@ -160,7 +161,7 @@ class Iteration:
             regularization=_regularized(it, s, search),
         )
 
-    def descent(self, it: Iterate, subproblem: kkt.Subproblem, step: kkt.Step):
+    def descent(self, it: Iterate, subproblem: kkt.Subproblem, step: kkt.Step) -> Float[Array, " P"]:
         """The slope of the barrier problem's objective along the step."""
         n = self.model.n
         gradient = self.model.stacked(subproblem.gradient, it.us, it.h)

@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from rtcd_jax.numerics import kkt
 from rtcd_jax.numerics.interior_point.boxes import Boxed, log_sum, total
@@ -21,7 +21,9 @@ class Direction(NamedTuple):
     descent: Float[Array, " P"]
     usable: Bool[Array, " P"]
 
-    def point(self, it: Iterate, length):
+    def point(
+        self, it: Iterate, length: Float[Array, " P"]
+    ) -> tuple[Float[Array, "knots n P"], Float[Array, "intervals m P"], Float[Array, " P"]]:
         """xs, us and h at a length."""
         step = self.step
         return it.xs + length * step.dxs, it.us + length * step.dus, it.h + length * step.dh
@@ -63,7 +65,13 @@ class _Filter(NamedTuple):
         rounding = 10 * eps * it.defects[..., 0].size, 10 * eps * jnp.abs(merit)
         return cls(total(jnp.abs(it.defects)), merit, jnp.maximum(1.0, it.violation_start), it.filter, rounding)
 
-    def judge(self, length, descent, violation, merit):
+    def judge(
+        self,
+        length: Float[Array, " P"],
+        descent: Float[Array, " P"],
+        violation: Float[Array, " P"],
+        merit: Float[Array, " P"],
+    ) -> tuple[Bool[Array, " P"], Bool[Array, " P"]]:
         """Whether a trial is accepted, and whether the filter then gets an entry."""
         by_violation, by_merit = self.rounding
         steep = jnp.where(descent < 0, -descent, 0.0)
@@ -76,7 +84,7 @@ class _Filter(NamedTuple):
         accepted = (violation <= 10 * self.start) & free & jnp.where(switching, armijo, better)
         return accepted, ~(switching & armijo)
 
-    def with_entry(self, add, filtered):
+    def with_entry(self, add: Bool[Array, " P"], filtered: Int[Array, " P"]) -> Float[Array, "F 2 P"]:
         """The filter's entries, with the present point's in the oldest place where `add`: (22)."""
         slots = self.entries.shape[0]
         slot = (jnp.arange(slots)[:, None] == filtered % slots) & add
@@ -84,7 +92,9 @@ class _Filter(NamedTuple):
         return jnp.where(slot[:, None], entry, self.entries)
 
 
-def line_search(model: Model, s: Settings, it: Iterate, slacks: Boxed, direction: Direction, parameters) -> Search:
+def line_search(
+    model: Model, s: Settings, it: Iterate, slacks: Boxed, direction: Direction, parameters: PyTree
+) -> Search:
     """Backtrack to the first length that the filter accepts: algorithm A-5.
 
     After four failures in a row the filter is emptied and the last, short step taken.

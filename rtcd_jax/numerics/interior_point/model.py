@@ -4,7 +4,9 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, DTypeLike, Float, PyTree
 
+from rtcd_jax.numerics.entries import Row
 from rtcd_jax.numerics.expansion import Expansion, expander
 from rtcd_jax.numerics.interior_point.iterate import Boxed
 from rtcd_jax.numerics.interior_point.problem import ControlProblem
@@ -13,7 +15,7 @@ from rtcd_jax.numerics.interior_point.problem import ControlProblem
 class Model:
     """The problem with its constants at hand; all methods are pure."""
 
-    def __init__(self, problem: ControlProblem, dtype):
+    def __init__(self, problem: ControlProblem, dtype: DTypeLike):
         self.problem, self.dtype = problem, dtype
         self.n, self.m = len(problem.start), len(problem.input_limits)
         self.boxed = np.flatnonzero(np.isfinite(problem.state_limits))
@@ -28,13 +30,26 @@ class Model:
         self.scaling = [float(s) for s in (*1 / scale_x**2, 0.0, *1 / problem.input_limits**2)]
         self.step_scaling = 4 / (high - low) ** 2 if self.free_step else 0.0
 
-    def simulate(self, xs, us, h, parameters):
-        """Defects [N n P] and the objective [P]."""
+    def simulate(
+        self,
+        xs: Float[Array, "knots n P"],
+        us: Float[Array, "intervals m P"],
+        h: Float[Array, " P"],
+        parameters: PyTree,
+    ) -> tuple[Float[Array, "intervals n P"], Float[Array, " P"]]:
+        """Defects and the objective."""
         x, u = jnp.moveaxis(xs[:-1], 0, 1), jnp.moveaxis(us, 0, 1)
         nexts = self.problem.interval(x, u, h, parameters)
         return jnp.moveaxis(nexts, 1, 0) - xs[1:], h * jnp.sum(self.problem.running(tuple(x), tuple(u), parameters), 0)
 
-    def expand(self, xs, us, h, multipliers, parameters) -> Expansion:
+    def expand(
+        self,
+        xs: Float[Array, "knots n P"],
+        us: Float[Array, "intervals m P"],
+        h: Float[Array, " P"],
+        multipliers: Float[Array, "intervals n P"],
+        parameters: PyTree,
+    ) -> Expansion:
         """The model's slopes and curvature; entries [N P] or numbers."""
         expand = expander(self.problem.rate, self.problem.running, self.n, self.m, parameters)
         stages = (xs[:-1], us, multipliers)
@@ -58,7 +73,7 @@ class Model:
         fill = lambda number: next(arrays) if number is None else number  # noqa: E731
         return jax.tree.map(fill, numbers, is_leaf=lambda leaf: leaf is None)
 
-    def values(self, xs, us, h) -> Boxed:
+    def values(self, xs: Float[Array, "knots n P"], us: Float[Array, "intervals m P"], h: Float[Array, " P"]) -> Boxed:
         """The bounded variables of a point."""
         return Boxed(xs[1:-1, self.boxed], us, h[None] if self.free_step else h[None][:0])
 
@@ -66,6 +81,8 @@ class Model:
         """Their distances from the lower and the upper bounds, on a leading axis."""
         return jax.tree.map(lambda v, lo, hi: jnp.stack([v - lo, hi - v]), values, self.lower, self.upper)
 
-    def stacked(self, row, us, h):
-        """A row of entries [N P], or numbers, as an array [N w P]."""
+    def stacked(
+        self, row: Row, us: Float[Array, "intervals m P"], h: Float[Array, " P"]
+    ) -> Float[Array, "intervals w P"]:
+        """A row of entries [intervals P], or numbers, as an array."""
         return jnp.stack([jnp.broadcast_to(entry, (us.shape[0], h.shape[-1])) for entry in row], 1)
