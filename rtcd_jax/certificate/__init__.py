@@ -1,1 +1,1 @@
-"""Elites -> certificates: a sum-of-squares proof of every funnel, and the checker that needs to believe nobody."""
+"""Elites -> certificates: a sum-of-squares proof of every funnel, and a checker that shares no code with the prover."""

@@ -1,10 +1,10 @@
-"""Does a stored certificate prove a stored elite? The one answer that reports and exports give.
+"""Whether a stored certificate proves a stored elite: the one answer that reports and exports give.
 
 It does if the checker accepts the very file, and if the closed loop that the file claims is the elite's: plant,
 parameters, limits, dt, x, u, K, x_goal and K_goal bit by bit, and the rates to within their rounding.
 
-Checking takes seconds, so that verdicts are remembered: in the user's own cache, by the digests of the file and of
-the checker's source. A run folder may come from anybody; no verdict is read from it.
+Checking takes seconds. Verdicts are therefore cached in the user's own cache, by the digests of the file and of the
+checker's source. No verdict is read from a run folder, which may come from anybody.
 """
 
 import hashlib
@@ -62,7 +62,7 @@ def certificate_path(run: Path, name: str) -> Path:
 def standing(run: Path, name: str, progress: Callable[[int, int], None] = lambda done, of: None) -> Standing:
     """What `certificates/NAME.json` of a run folder is worth for the folder's elite NAME.
 
-    `progress(done, of)` is told the intervals while the checker runs.
+    `progress(done, of)` gets the number of intervals while the checker runs.
 
     Raises:
         UserError: the elite cannot be read.
@@ -102,9 +102,9 @@ def difference(claimed: Mapping[str, Any], stored: Mapping[str, Any]) -> str:
     """The first number of a certificate's claim that is not the stored elite's, with both; empty if there is none."""
     largest = np.max(np.abs([float.fromhex(rate) for rate in np.ravel(stored["rates"])]))
     for key in sorted(stored, key="rates".__eq__):  # the rates last: they follow from the others
-        told = _difference(key, claimed[key], stored[key], RATE_ROUNDING * largest if key == "rates" else 0.0)
-        if told:
-            return told
+        text = _difference(key, claimed[key], stored[key], RATE_ROUNDING * largest if key == "rates" else 0.0)
+        if text:
+            return text
     return ""
 
 
@@ -118,14 +118,14 @@ def _difference(place: str, claimed: Any, stored: Any, tolerance: float) -> str:
     elif claimed == stored:
         return ""
     elif place == "plant" or claimed is None or stored is None:
-        return f"{place} is {_told(place, claimed)} there, {_told(place, stored)} in the elite"
+        return f"{place} is {_shown(place, claimed)} there, {_shown(place, stored)} in the elite"
     else:
         theirs, ours = float.fromhex(claimed), float.fromhex(stored)
         return "" if abs(theirs - ours) <= tolerance else f"{place} = {theirs!r} there, {ours!r} in the elite"
     return next(filter(None, (_difference(*pair, tolerance) for pair in pairs)), "")
 
 
-def _told(place: str, value: Any) -> str:
+def _shown(place: str, value: Any) -> str:
     return "none" if value is None else repr(value if place == "plant" else float.fromhex(value))
 
 
@@ -144,19 +144,19 @@ def _checked(content: Any, digest: str, progress: Callable[[int, int], None]) ->
 
 def accepted(report: Report, digest: str) -> Standing:
     """A proof: what the checker reports of a file of this digest."""
-    return Standing("proved", "", report.digest, digest, report.start, report.stretches, report.volumes)
+    return Standing("proved", "", report.digest, digest, report.start, report.intervals, report.volumes)
 
 
 # The cache ------------------------------------------------------------------------------------------------------------
 
 
-def remember(digest: str, found: Standing) -> Standing:
-    """Keeps the checker's verdict on a file of this digest, where the user has a cache; the same verdict."""
+def remember(digest: str, verdict: Standing) -> Standing:
+    """Caches the checker's verdict on a file of this digest, where the user has a cache; returns the same verdict."""
     path = _cached(digest)
-    with suppress(UserError, OSError):  # a home that cannot be written costs time, no more
+    with suppress(UserError, OSError):  # a home that cannot be written only costs time
         path.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
-        replace_json(path, asdict(found))
-    return found
+        replace_json(path, asdict(verdict))
+    return verdict
 
 
 def _remembered(digest: str) -> Standing | None:
@@ -174,7 +174,7 @@ def _cached(digest: str) -> Path:
 
 @cache
 def checker_digest() -> str:
-    """The SHA-256 of the checker's source: another checker decides anew."""
+    """The SHA-256 of the checker's source: the verdicts of another checker do not count."""
     total = hashlib.sha256()
     for source in sorted(Path(check.__file__).parent.glob("*.py")):
         content = source.read_bytes()

@@ -7,7 +7,7 @@ from typing import Any, final
 import numpy as np
 from jaxtyping import Float
 
-from rtcd_jax.certificate.check import Node, parse, read_claim, read_stretch
+from rtcd_jax.certificate.check import Node, parse, read_claim, read_interval
 from rtcd_jax.certificate.check.file import read_goal
 
 
@@ -29,11 +29,11 @@ class ProvedFunnel:
         """Of a certificate that the checker accepts, its exact numbers rounded."""
         content = parse(path.read_bytes())
         claim = read_claim(Node("claim", content["claim"]))
-        stretches = [read_stretch(Node("funnel", stretch), claim) for stretch in content["funnel"]]
+        intervals = [read_interval(Node("funnel", interval), claim) for interval in content["funnel"]]
         begins, axes = [], []
-        for stretch in stretches:
-            begins.append(float(stretch.knot + stretch.start))
-            first, last, (bend_0, bend_1) = map(_floats, (stretch.first, stretch.last, stretch.bend))
+        for interval in intervals:
+            begins.append(float(interval.knot + interval.start))
+            first, last, (bend_0, bend_1) = map(_floats, (interval.first, interval.last, interval.bend))
             axes.append([(first + last) / 2 + bend_0, (last - first) / 2 + bend_1, -bend_0, -bend_1])
         goal = _floats(read_goal(Node("goal", content["goal"]), claim)[0])
         begins.append(float(len(claim.u)))

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from rtcd_jax.certificate import check
-from rtcd_jax.certificate.prove import backward as descent
+from rtcd_jax.certificate.prove import backward
 from rtcd_jax.certificate.prove import certify as elite
-from rtcd_jax.certificate.prove.closed_loop import Loop, claim_of, double, sealed
+from rtcd_jax.certificate.prove.closed_loop import Loop, claim_of, double, with_digests
 from rtcd_jax.certificate.prove.run import certify_run, rank_correlation
 from rtcd_jax.cli import main as cli
 from rtcd_jax.elite.elite import Elite
@@ -25,7 +25,7 @@ def folder_of(path, **changed):
 
 def claimed(elite):
     told = {**claim_of(elite), "start": [0, double(0.0)]}
-    return check.read_claim(check.Node("claim", sealed(told)))
+    return check.read_claim(check.Node("claim", with_digests(told)))
 
 
 def test_the_claim_is_the_elite_bit_by_bit(content):
@@ -63,15 +63,15 @@ def test_levels_are_as_large_as_the_loop_allows(content):
     """The proved funnel gives away little: its outlet touches the limit on the speed, or V would rise on it."""
     axes = np.array([[float.fromhex(c) for c in row] for row in content["goal"]["axes"]])
     assert 6.9 < np.linalg.norm(axes[1]) <= 7
-    spared = [each.spare for each in steps_of(swing.elite())]
-    assert max(spared) <= 0.04
+    decay_margins = [each.decay_margin for each in steps_of(swing.elite())]
+    assert max(decay_margins) <= 0.04
 
 
 def steps_of(stored):
     elite = Elite.of(*stored)
     claim = claimed(elite)
-    search = descent.Descent(claim, Loop(claim, elite), exact=False)
-    return list(search.down_from(search.outlet(15.0)))
+    proof = backward.BackwardProof(claim, Loop(claim, elite), exact=False)
+    return list(proof.intervals_from(proof.outlet(15.0)))
 
 
 def test_a_gain_of_the_wrong_sign_cannot_be_proved(tmp_path):

@@ -54,7 +54,7 @@ def test_motions_are_those_of_an_outside_integrator(content):
     """One motion from the inlet to t_N, beside scipy's at 1e-12."""
     motions = Motions(content)
     y = np.array([0.6, -0.8])
-    x = motions._nominal(0, 0.0) + motions.pieces[0].axes(0.0) @ y
+    x = motions._nominal(0, 0.0) + motions.intervals[0].axes(0.0) @ y
     gains, inputs = floats(content["claim"]["K"]), floats(content["claim"]["u"])
     for k, u in enumerate(inputs):
 

@@ -5,7 +5,7 @@ import pytest
 from scipy.linalg import expm, solve_continuous_are
 
 from rtcd_jax.certificate import check
-from rtcd_jax.certificate.prove.closed_loop import Loop, claim_of, double, sealed
+from rtcd_jax.certificate.prove.closed_loop import Loop, claim_of, double, with_digests
 from rtcd_jax.certificate.prove.goal import goal_region
 from rtcd_jax.elite.elite import Elite
 from tests.certificate import swing
@@ -32,9 +32,9 @@ class Upright:
             "K_goal": self.K, "x_goal": swing.UPRIGHT, "u_max": np.array([self.limit]), "rho": np.ones(2),
             "volumes_per_knot": np.ones(2),
         }  # fmt: skip
-        told = {"plant": "pendulum", "parameters": parameters, "state_limits": [None, None], **swing.PROMISE}
-        elite = Elite.of(arrays, told)
-        claim = check.read_claim(check.Node("claim", sealed({**claim_of(elite), "start": [0, double(0.0)]})))
+        record = {"plant": "pendulum", "parameters": parameters, "state_limits": [None, None], **swing.PROMISE}
+        elite = Elite.of(arrays, record)
+        claim = check.read_claim(check.Node("claim", with_digests({**claim_of(elite), "start": [0, double(0.0)]})))
         self.claim, self.loop = claim, Loop(claim, elite)
         region = goal_region(claim, self.loop, exact=True)
         assert region is not None

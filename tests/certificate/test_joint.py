@@ -8,14 +8,14 @@ from rtcd_jax.certificate.enlarge import all_knots as joint
 from rtcd_jax.certificate.prove import certify as elite
 from rtcd_jax.certificate.prove.closed_loop import Loop
 from rtcd_jax.certificate.prove.goal import goal_region
-from rtcd_jax.certificate.prove.levels import SHARES, SPARED, directions, goal_level, leveled, merit
+from rtcd_jax.certificate.prove.levels import DECAY_MARGIN, FRACTIONS, goal_level, leveled, merit, unit_directions
 from rtcd_jax.elite.elite import Elite
 from tests.certificate import swing
 from tests.certificate.folder import folder_with
 from tests.certificate.test_certify import claimed
 from tests.certificate.test_goal import PAPER, Upright
 
-AIMS = directions(2)
+DIRECTIONS = unit_directions(2)
 
 
 def loop_of(arrays=None, **record):
@@ -27,40 +27,40 @@ def loop_of(arrays=None, **record):
 @pytest.fixture(scope="module")
 def funnel():
     """A funnel of TVLQR's shapes, its levels 1, without a limit on the speed."""
-    return leveled(loop_of(state_limits=[None, None]), AIMS)
+    return leveled(loop_of(state_limits=[None, None]), DIRECTIONS)
 
 
 def fastest(loop):
     """The largest V' / V on the boundaries of every interval's instants, and at the goal."""
-    growth = [loop.growth(k, share, 1.0, AIMS) for k in range(len(loop.u)) for share in SHARES]
-    return np.array([*growth, loop.goal_growth(1.0, AIMS)])
+    growth = [loop.growth(k, fraction, 1.0, DIRECTIONS) for k in range(len(loop.u)) for fraction in FRACTIONS]
+    return np.array([*growth, loop.goal_growth(1.0, DIRECTIONS)])
 
 
 def test_levels_become_one(funnel):
-    """V falls at the spare rate everywhere on the funnel, no faster where it is tightest, and the goal's level is 1."""
-    assert goal_level(funnel, AIMS) == pytest.approx(1, abs=1e-9)
-    np.testing.assert_allclose(fastest(funnel)[:-1], -SPARED, atol=3e-3)
-    again = leveled(funnel, AIMS)
+    """V falls everywhere at the decay margin, no faster where the funnel is tightest; the goal's level is 1."""
+    assert goal_level(funnel, DIRECTIONS) == pytest.approx(1, abs=1e-9)
+    np.testing.assert_allclose(fastest(funnel)[:-1], -DECAY_MARGIN, atol=3e-3)
+    again = leveled(funnel, DIRECTIONS)
     np.testing.assert_allclose(np.linalg.det(again.values), np.linalg.det(funnel.values), rtol=2e-3)
 
 
 def test_what_a_program_gains_is_the_merit_s_derivative(funnel):
     program, random = joint.Program(funnel, 1.0), np.random.default_rng(0)
     for _ in range(3):
-        x = random.normal(size=program.reach.size)
+        x = random.normal(size=program.radius.size)
         step = 1e-5
         ahead, behind = (merit(program.changed(sign * step * x)) for sign in (1, -1))
         assert program.gain() @ x == pytest.approx((ahead - behind) / (2 * step), rel=1e-6)
 
 
 def test_a_short_step_keeps_v_falling_to_first_order(funnel, monkeypatch):
-    """What it makes of V' beyond the spare rate in the directions asked for is of second order, the gain of first."""
-    monkeypatch.setattr(joint, "THINNED", 1)
-    monkeypatch.setattr(joint, "KEPT", AIMS.shape[1])
+    """What it makes of V' beyond the decay margin in the directions asked for is of second order, the gain of first."""
+    monkeypatch.setattr(joint, "DIRECTION_STRIDE", 1)
+    monkeypatch.setattr(joint, "DIRECTIONS_PER_INSTANT", DIRECTIONS.shape[1])
     beyond, gains = [], []
     for trust in (0.02, 0.01):
         after = joint.changed(funnel, trust)
-        beyond.append(np.max(fastest(after) - np.maximum(fastest(funnel), -SPARED)))
+        beyond.append(np.max(fastest(after) - np.maximum(fastest(funnel), -DECAY_MARGIN)))
         gains.append(merit(after) - merit(funnel))
     assert beyond[0] < 2 * 0.02**2
     assert beyond[1] < 2 * 0.01**2
@@ -69,15 +69,15 @@ def test_a_short_step_keeps_v_falling_to_first_order(funnel, monkeypatch):
 
 
 def test_limits_on_the_states_are_kept_to_first_order():
-    loop = leveled(loop_of(state_limits=[0.7, 6.0]), AIMS)
+    loop = leveled(loop_of(state_limits=[0.7, 6.0]), DIRECTIONS)
     most = 0.0
     for _ in range(6):
         loop = joint.changed(loop, 0.1)
-        loop = leveled(loop, AIMS)
+        loop = leveled(loop, DIRECTIONS)
         for k in range(len(loop.u)):
-            for share in SHARES:
-                widths = np.sqrt(np.diag(np.linalg.inv(loop.value(k, share)[0])))
-                most = max(most, np.max(widths / loop.rooms(k, share)))
+            for fraction in FRACTIONS:
+                widths = np.sqrt(np.diag(np.linalg.inv(loop.value(k, fraction)[0])))
+                most = max(most, np.max(widths / loop.clearance(k, fraction)))
     assert 0.97 < most < 1.005
 
 
@@ -94,8 +94,8 @@ def test_its_funnels_are_larger_and_proved(tmp_path):
         run = folder_with(tmp_path / name, arrays, record)
         outcome = elite.certify_elite(run, "000", "proved", lambda step: None, optimize_value=freed)
         assert outcome.whole
-        assert check.check_file(run / "certificates" / "000.json").volumes == outcome.found
-        sums.append(outcome.found["sum"])
+        assert check.check_file(run / "certificates" / "000.json").volumes == outcome.volumes
+        sums.append(outcome.volumes["sum"])
     assert sums[1] > 1.5 * sums[0]
 
 

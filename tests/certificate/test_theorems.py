@@ -5,7 +5,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from rtcd_jax.certificate import check
-from rtcd_jax.certificate.check import Obligation, Q, Refused, Witness, polynomial
+from rtcd_jax.certificate.check import GramCertificate, Obligation, Q, Refused, polynomial
 from rtcd_jax.certificate.prove import sdp as program
 
 NOTHING = Q(0)
@@ -23,7 +23,7 @@ def shown(todo, degree, bernstein=0, multiplier=0):
     """The margin that the checker accepts, or None."""
     shape = program.shape_of(todo, degree, bernstein, multiplier)
     found = program.solve(program.data_of(todo, shape), shape)
-    return None if found is None else float(check.margin(todo, found.witness, "theorem"))
+    return None if found is None else float(check.margin(todo, found.certificate, "theorem"))
 
 
 def cubic(level):
@@ -146,20 +146,22 @@ def test_an_error_is_taken_from_the_margin():
     todo = cubic(0.5)
     shape = program.shape_of(todo, 1, 2, 0)
     found = program.solve(program.data_of(todo, shape), shape)
-    assert float(check.margin(todo, found.witness, "x")) == pytest.approx(1, abs=1e-5)
-    assert float(check.margin(todo._replace(error=exact(0.25)), found.witness, "x")) == pytest.approx(0.75, abs=1e-5)
+    assert float(check.margin(todo, found.certificate, "x")) == pytest.approx(1, abs=1e-5)
+    assert float(check.margin(todo._replace(error=exact(0.25)), found.certificate, "x")) == pytest.approx(
+        0.75, abs=1e-5
+    )
     with pytest.raises(Refused, match=r"x\.gram\[\d\]: proves no decrease: at best -0\.5"):
-        check.margin(todo._replace(error=exact(1.5)), found.witness, "x")
+        check.margin(todo._replace(error=exact(1.5)), found.certificate, "x")
 
 
 def test_indefinite_matrices_are_refused():
     todo = cubic(0.5)
     shape = program.shape_of(todo, 1, 2, 0)
-    found = program.solve(program.data_of(todo, shape), shape).witness
+    found = program.solve(program.data_of(todo, shape), shape).certificate
     gram = [[row[:] for row in matrix] for matrix in found.gram]
     gram[1][0][0] = Q(-1, 1 << 60)
     with pytest.raises(Refused, match=r"x\.gram\[1\]: is not positive definite"):
-        check.margin(todo, Witness(found.degree, gram, []), "x")
+        check.margin(todo, GramCertificate(found.degree, gram, []), "x")
     with pytest.raises(Refused, match="needs 0 multipliers"):
         check.margin(todo, found._replace(multipliers=[[]]), "x")
     with pytest.raises(Refused, match="order 2 in time needs more than 2 Bernstein polynomials"):

@@ -227,7 +227,7 @@ def test_a_candidate_without_a_funnel_is_not_exported(tmp_path):
 
 def test_a_proved_elites_claim_stands_wherever_its_controller_does(proved):
     content = json.loads((proved.folder / "certificate.json").read_text())
-    claim = check.seal(content["claim"])
+    claim = check.digest(content["claim"])
     assert (proved.folder / "certificate.json").read_bytes() == (proved.run / "certificates" / "000.json").read_bytes()
     told = json.loads((proved.folder / "pendulum_000_controller.json").read_text())
     assert (told["certificate"]["rung"], told["certificate"]["claim"]) == ("proved", claim)

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from rtcd_jax.certificate.check import Node, Q, read_claim, read_stretch
+from rtcd_jax.certificate.check import Node, Q, read_claim, read_interval
 from rtcd_jax.certificate.check.file import read_goal
 from rtcd_jax.export import rate, source, tables
 from rtcd_jax.export.proof import ProvedFunnel
@@ -22,7 +22,7 @@ def claimed(proved):
     """Of the exported certificate, in exact numbers: its claim, its intervals and its goal's axes."""
     content = json.loads((proved.folder / "certificate.json").read_text())
     claim = read_claim(Node("claim", content["claim"]))
-    pieces = [read_stretch(Node("funnel", each), claim) for each in content["funnel"]]
+    pieces = [read_interval(Node("funnel", each), claim) for each in content["funnel"]]
     return claim, pieces, read_goal(Node("goal", content["goal"]), claim)[0]
 
 

@@ -80,21 +80,21 @@ def audit_funnel(external: ExternalFunnel, cost: Cost, states: int, seed: int, o
     config = config_of(given, cost)
     _claim(out)
     try:
-        found = escapes(Elite.of(*elite_of(given, cost)), states, seed)
+        result = escapes(Elite.of(*elite_of(given, cost)), states, seed)
         off = np.max(np.abs(defects(given)), axis=0)
         solution = projected(given, cost)
     except np.linalg.LinAlgError as error:
         raise UserError(f"the numbers of the robot, its cost and its funnel do not go together: {error}") from None
-    replace_json(out / RECORD, _record(given, solution, found, off, misfits, states, seed))
+    replace_json(out / RECORD, _record(given, solution, result, off, misfits, states, seed))
     write_folder(out, config, given, solution, cost)
-    console.message(_table(given, found))
-    for line in [*_inputs(misfits, given), *_summary(given, solution, found, off, states)]:
+    console.message(_table(given, result))
+    for line in [*_inputs(misfits, given), *_summary(given, solution, result, off, states)]:
         console.message(line)
     console.message(
         f"stored as a run: {out}/elites/000 (projected onto the dynamics), 001 (as given); prove them by `rtcd certify "
         f"{out} --elites 2`"
     )
-    return not np.any(found.share > 0)
+    return not np.any(result.share > 0)
 
 
 def _claim(out: Path) -> None:
@@ -108,7 +108,7 @@ def _claim(out: Path) -> None:
 def _record(
     given: ExternalFunnel,
     solution: ExternalFunnel,
-    found: Escapes,
+    result: Escapes,
     off: np.ndarray,
     misfits: Mapping[str, float],
     states: int,
@@ -121,17 +121,17 @@ def _record(
         "misfit_of_inputs": misfits,
         "largest_defect": off,
         "moved_by_mending": np.max(np.abs(solution.x - given.x), axis=0),
-        "knots": found._asdict(),
+        "knots": result._asdict(),
     }
 
 
-def _table(given: ExternalFunnel, found: Escapes) -> str:
-    worst = np.argsort(-found.next_share, kind="stable")[:WORST]
+def _table(given: ExternalFunnel, result: Escapes) -> str:
+    worst = np.argsort(-result.next_share, kind="stable")[:WORST]
     rows = [
         (
-            f"{k}", f"{k * given.dt:.3g}", f"{found.next_share[k]:.1%}", f"{found.next_level[k]:.3g}",
-            f"{found.share[k]:.1%}", f"{found.level[k]:.3g}", f"{found.goal_share[k]:.1%}",
-            f"{found.limit_share[k]:.1%}",
+            f"{k}", f"{k * given.dt:.3g}", f"{result.next_share[k]:.1%}", f"{result.next_level[k]:.3g}",
+            f"{result.share[k]:.1%}", f"{result.level[k]:.3g}", f"{result.goal_share[k]:.1%}",
+            f"{result.limit_share[k]:.1%}",
         )
         for k in [0, *sorted(int(k) for k in worst if k)]
     ]  # fmt: skip
@@ -147,12 +147,12 @@ def _inputs(misfits: Mapping[str, float], given: ExternalFunnel) -> list[str]:
     if len(misfits) < 2:
         return []
     taken = "as written" if np.array_equal(given.u, given.inputs[:-1]) else "moved by one knot"
-    told = ", ".join(f"{name} {misfit:.2g}" for name, misfit in misfits.items())
-    return [f"inputs taken {taken}; largest misfit of a knot, in shares of the states' largest values: {told}"]
+    texts = ", ".join(f"{name} {misfit:.2g}" for name, misfit in misfits.items())
+    return [f"inputs taken {taken}; largest misfit of a knot, in shares of the states' largest values: {texts}"]
 
 
 def _summary(
-    given: ExternalFunnel, solution: ExternalFunnel, found: Escapes, off: np.ndarray, states: int
+    given: ExternalFunnel, solution: ExternalFunnel, result: Escapes, off: np.ndarray, states: int
 ) -> list[str]:
     names, intervals = given.plant.states, len(given.u)
     moved = np.max(np.abs(solution.x - given.x), axis=0)
@@ -161,11 +161,11 @@ def _summary(
         return ", ".join(f"{name} {number:.3g}" for name, number in zip(names, numbers, strict=True))
 
     return [
-        f"{states} states of each ellipsoid: from {np.sum(found.next_share > 0)} of {intervals} some leave the next "
-        f"one, from {np.sum(found.share > 0)} some leave a later one, {found.share[0]:.1%} of the first one's",
-        f"of all states {found.goal_share.mean():.1%} miss the goal's ellipsoid at the last knot, "
-        f"{found.limit_share.mean():.1%} leave the limits on the states; of the first ellipsoid's "
-        f"{found.goal_share[0]:.1%} and {found.limit_share[0]:.1%}",
+        f"{states} states of each ellipsoid: from {np.sum(result.next_share > 0)} of {intervals} some leave the next "
+        f"one, from {np.sum(result.share > 0)} some leave a later one, {result.share[0]:.1%} of the first one's",
+        f"of all states {result.goal_share.mean():.1%} miss the goal's ellipsoid at the last knot, "
+        f"{result.limit_share.mean():.1%} leave the limits on the states; of the first ellipsoid's "
+        f"{result.goal_share[0]:.1%} and {result.limit_share[0]:.1%}",
         f"the nominal motion misses its next knot by up to {by_state(off)}; projecting it onto the dynamics moves its "
         f"knots by up to {by_state(moved)}",
     ]

@@ -115,11 +115,11 @@ def _require_parameters(plant: Plant, name: str, parameters: Mapping[str, float]
 
 def _numbers(path: Path, width: int, columns: str, last: int | None = None) -> np.ndarray:
     """The rows of `width` numbers; the last row's cell at place `last` may hold none, and is nan then."""
-    found = _matrix(path, f"a table of the columns {columns}", last)
-    if found.shape[1] != width or len(found) < 2:
-        shape = f"{len(found)} of {found.shape[1]}"
+    table = _matrix(path, f"a table of the columns {columns}", last)
+    if table.shape[1] != width or len(table) < 2:
+        shape = f"{len(table)} of {table.shape[1]}"
         raise UserError(f"{path}: must have at least 2 rows of {width} finite numbers: {columns}; it has {shape}")
-    return found
+    return table
 
 
 def _matrix(path: Path, what: str, last: int | None = None) -> np.ndarray:
@@ -128,19 +128,19 @@ def _matrix(path: Path, what: str, last: int | None = None) -> np.ndarray:
     if not rows:
         raise UserError(f"{path} has no rows of numbers: must be {what}")
     width = len(rows[0][1])
-    found = np.full((len(rows), width), math.nan)
+    numbers = np.full((len(rows), width), math.nan)
     for k, (line, cells) in enumerate(rows):
         if len(cells) != width:
             raise UserError(f"{path}, line {line} has {len(cells)} cells, the first row {width}: must be {what}")
         for place, cell in enumerate(cells):
             value = _number(cell)
-            found[k, place] = value
+            numbers[k, place] = value
             if not abs(value) <= LARGEST and not (k == len(rows) - 1 and place == last and not cell.strip("naNA")):
                 raise UserError(
                     f"{path}, line {line}, cell {place + 1} = {shown(cell)}: must be a finite number, of at most "
                     f"{LARGEST:g} in size; the file must be {what}"
                 )
-    return found
+    return numbers
 
 
 def _number(cell: str) -> float:
@@ -152,21 +152,21 @@ def _number(cell: str) -> float:
 
 def _levels_and_values(path: Path, knots: int, n: int) -> tuple[np.ndarray, np.ndarray]:
     """rho [knots] and S [knots n n] of a file with a knot a column, or a knot a row: rho, then S row by row."""
-    found = _matrix(path, f"a funnel file: rho and the {n * n} entries of S of every knot")
+    table = _matrix(path, f"a funnel file: rho and the {n * n} entries of S of every knot")
     size = 1 + n * n
-    read = []
-    for numbers in (found.T, found):  # where both fit, the one whose S is symmetric, else a knot a column
+    candidates = []
+    for numbers in (table.T, table):  # where both fit, the one whose S is symmetric, else a knot a column
         if numbers.shape == (knots, size):
             s = numbers[:, 1:].reshape(knots, n, n)
             asymmetry = np.max(np.abs(s - np.swapaxes(s, 1, 2))) / max(np.max(np.abs(s)), SMALLEST)
-            read.append((asymmetry, numbers[:, 0], (s + np.swapaxes(s, 1, 2)) / 2))
-    if read:
-        asymmetry, rho, s = min(read, key=lambda each: each[0] > EVEN)
+            candidates.append((asymmetry, numbers[:, 0], (s + np.swapaxes(s, 1, 2)) / 2))
+    if candidates:
+        asymmetry, rho, s = min(candidates, key=lambda each: each[0] > EVEN)
         if asymmetry <= SYMMETRIC:
             return rho, s
         raise UserError(f"{path}: an S is not symmetric, by {asymmetry:.1%} of the largest entry")
     raise UserError(
-        f"{path} has {found.shape[0]} rows of {found.shape[1]} numbers: must have {size} rows (rho, S row by row) of "
+        f"{path} has {table.shape[0]} rows of {table.shape[1]} numbers: must have {size} rows (rho, S row by row) of "
         f"{knots} numbers, one for each knot of the trajectory, or {knots} rows of {size}"
     )
 

@@ -82,7 +82,7 @@ def projected(external: ExternalFunnel, cost: Cost) -> ExternalFunnel:
     """The nearest motion that solves the dynamics, with S of its own TVLQR and levels that keep the volumes.
 
     Raises:
-        UserError: none was found.
+        UserError: there is none.
     """
     x, u = external.x.copy(), external.u.copy()
     x[-1] = external.goal
@@ -115,9 +115,9 @@ def _nearest(
     scale = np.maximum(np.max(np.abs(external.x), axis=0), SMALLEST)
     weights = np.concatenate([np.tile(scale**-2, knots), np.full(len(u), external.limit**-2)])
     given = np.concatenate([external.x.ravel(), external.u])
-    room = np.full_like(x, np.inf)
-    room[1:-1] = INSIDE * limits
-    bounds = np.concatenate([room.ravel(), np.full(len(u), INSIDE * external.limit)])
+    limit_of = np.full_like(x, np.inf)
+    limit_of[1:-1] = INSIDE * limits
+    bounds = np.concatenate([limit_of.ravel(), np.full(len(u), INSIDE * external.limit)])
     bounded = sp.csr_matrix(sp.identity(len(bounds)))[np.isfinite(bounds)]
     finite = bounds[np.isfinite(bounds)]
     settings = clarabel.DefaultSettings()
@@ -165,6 +165,6 @@ def tracking_values(external: ExternalFunnel, cost: Cost) -> np.ndarray:
             a, b = linear(plant, parameters, x, u)
             return -riccati_rate(flat.reshape(n, n), a, b[:, None], q, np.array([r])).ravel()
 
-        found = solve_ivp(backward, (0, external.dt), values[0].ravel(), method="LSODA", rtol=1e-9, atol=1e-9)
-        values.insert(0, found.y[:, -1].reshape(n, n))
+        solution = solve_ivp(backward, (0, external.dt), values[0].ravel(), method="LSODA", rtol=1e-9, atol=1e-9)
+        values.insert(0, solution.y[:, -1].reshape(n, n))
     return np.array([(s + s.T) / 2 for s in values])

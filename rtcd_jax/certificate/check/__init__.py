@@ -1,19 +1,19 @@
 """The independent checker: it accepts a certificate only if the theorem below follows from it, by exact arithmetic.
 
 `rtcd check FILE` or `python -m rtcd_jax.certificate.check FILE`. It knows no solver and nothing of the rest of the
-package: the standard library is enough, and python-flint makes it faster. Who wants to believe a certificate needs to
-believe this folder alone. To be read in this order:
+package: the standard library is enough, and python-flint makes it faster. To trust a certificate is to trust this
+folder and nothing else. Read it in this order:
 
     exact     rational numbers and their rounding
-    taylor    polynomials in time and space, sine and cosine, with bounds of what they leave out
+    taylor    Taylor models: polynomials in time and space with bounds of their remainders; sine and cosine
     matrix    products and determinants
     claim     the robots' equations, and the closed loop that a certificate is about
     squares   positive on the sphere: sums of squares, by Bernstein polynomials in the time
-    funnel    what has to be shown on one interval of the funnel
-    goal      what has to be shown at the goal
-    file      the file's words into numbers
-    verdict   all of it together
-    command   what is printed
+    funnel    the obligations of one interval of the funnel
+    goal      the obligations of the goal region
+    file      the file's text into exact numbers
+    verdict   every obligation of a certificate, and what follows
+    command   `rtcd check`
 
 THEOREM. Let the claim hold a robot x' = f(x, u) with D(x) f(x, u) = a(x) + b(x) u, where a, b, D are polynomials in x
 and in the sine and cosine of one angle (claim.py), and its controller
@@ -54,19 +54,19 @@ from rtcd_jax.certificate.check.exact import (
     Refused,
     Undecided,
     alternating,
-    insist,
     near,
     printable,
+    require,
     root_up,
     up,
 )
-from rtcd_jax.certificate.check.file import Node, parse, read_bytes, read_claim, read_stretch, seal
-from rtcd_jax.certificate.check.funnel import Motion, Stretch, funnel_obligations, insist_bounds, motion
+from rtcd_jax.certificate.check.file import Node, digest, parse, read_bytes, read_claim, read_interval
+from rtcd_jax.certificate.check.funnel import Interval, Motion, funnel_obligations, motion, require_bounds
 from rtcd_jax.certificate.check.goal import Shell, goal_field, goal_obligations
 from rtcd_jax.certificate.check.matrix import cofactors
 from rtcd_jax.certificate.check.squares import (
+    GramCertificate,
     Obligation,
-    Witness,
     bernstein,
     is_positive,
     is_positive_definite,

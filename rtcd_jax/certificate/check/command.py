@@ -11,7 +11,7 @@ from pathlib import Path
 from rtcd_jax.certificate.check.claim import PLANTS
 from rtcd_jax.certificate.check.exact import Refused, Undecided, printable
 from rtcd_jax.certificate.check.file import parse, read_bytes
-from rtcd_jax.certificate.check.verdict import Report, check_file, sentence
+from rtcd_jax.certificate.check.verdict import check_file, sentence
 
 SECONDS = 600.0
 """For a stranger's file; the cart-pole's take 40 with python-flint."""
@@ -53,7 +53,10 @@ def main(arguments: Sequence[str]) -> int:
     except Refused as refused:
         print(f"REFUSED {printable(file)}\n{refused}", file=sys.stderr)
         return 1
-    _tell(report)
+    name = next(key for key, plant in PLANTS.items() if plant is report.claim.plant)
+    print(sentence(name, report))
+    for key, value in report.notes.items():
+        print(printable(f"note of the file's author, not proved: {key}: {value}", LONGEST_NOTE))
     if compared:
         print(f"NOT THE CONTROLLER OF THIS CERTIFICATE: {printable(lab)}: {compared}", file=sys.stderr)
         return 1
@@ -80,19 +83,19 @@ def _options(arguments: Sequence[str]) -> tuple[str, float, str | None]:
             files.append(word)
     if len(files) != 1:
         raise ValueError(f"{len(files)} files: must be one, as in `rtcd check RUN/certificates/000.json`")
-    told = given.get("--seconds", SECONDS)
+    text = given.get("--seconds", SECONDS)
     try:
-        seconds = float(told)
+        seconds = float(text)
     except ValueError:
         seconds = 0.0
     if not 0 < seconds <= 1e6:
-        raise ValueError(f"--seconds {told}: must be a number > 0 and <= 1e6")
+        raise ValueError(f"--seconds {text}: must be a number > 0 and <= 1e6")
     return files[0], seconds, given.get("--controller")
 
 
 @contextmanager
 def within(seconds: float) -> Iterator[None]:
-    """Ends what takes longer by Undecided; without any limit outside of the main thread, where no alarm rings."""
+    """Raises Undecided in what takes longer. There is no limit outside of the main thread, where no alarm rings."""
     if threading.current_thread() is not threading.main_thread() or not hasattr(signal, "setitimer"):
         yield
         return
@@ -138,14 +141,7 @@ def compare(lab: Path, digest: str) -> str:
     return ""
 
 
-def _tell(report: Report) -> None:
-    name = next(key for key, plant in PLANTS.items() if plant is report.claim.plant)
-    print(sentence(name, report))
-    for key, value in report.notes.items():
-        print(printable(f"note of the file's author, not proved: {key}: {value}", LONGEST_NOTE))
-
-
 def _counted(done: int, of: int) -> None:
-    """A live line, where somebody watches."""
+    """A live line on a terminal."""
     if sys.stderr.isatty():
         print(f"\rinterval {done} of {of}", end="\n" if done == of else "", file=sys.stderr, flush=True)

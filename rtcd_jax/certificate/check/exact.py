@@ -38,11 +38,11 @@ class Damaged(Refused):
 
 
 class Undecided(Exception):
-    """Neither accepted nor refused: the file asks for more time or memory than a stranger is given."""
+    """Neither accepted nor refused: the file asks for more time or memory than the limits allow."""
 
 
 def printable(text: object, longest: int = 400) -> str:
-    """A file's own words, on one line of ASCII that no terminal obeys."""
+    """A file's text on one line of ASCII, without control sequences."""
     shown = str(text)[:longest].encode("unicode_escape").decode("ascii")
     return shown if len(shown) <= longest and len(str(text)) <= longest else f"{shown[: longest - 3]}..."
 
@@ -55,7 +55,8 @@ def rounded(q) -> float:
         return math.inf if q > 0 else -math.inf
 
 
-def insist(holds: bool, place: str, reason: str) -> None:
+def require(holds: bool, place: str, reason: str) -> None:
+    """Refuses the certificate, at the place and for the reason, unless it holds."""
     if not holds:
         raise Refused(place, reason)
 

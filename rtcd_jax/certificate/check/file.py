@@ -1,4 +1,4 @@
-"""The file's words into exact numbers; whatever is not as docs/certificates.md says is refused with its place."""
+"""A file's text into exact numbers. Whatever is not as docs/certificates.md says is refused with its place."""
 
 import hashlib
 import json
@@ -16,12 +16,12 @@ from rtcd_jax.certificate.check.exact import (
     Q,
     Refused,
     Undecided,
-    insist,
+    require,
     rounded,
 )
-from rtcd_jax.certificate.check.funnel import Stretch
+from rtcd_jax.certificate.check.funnel import Interval
 from rtcd_jax.certificate.check.goal import Shell
-from rtcd_jax.certificate.check.squares import Witness, monomials
+from rtcd_jax.certificate.check.squares import GramCertificate, monomials
 
 MAX_NOTES = 20
 _DOUBLE = re.compile(r"-?0x[01](\.[0-9a-f]{1,13})?p[+-][0-9]{1,4}")
@@ -35,33 +35,33 @@ class Node(NamedTuple):
 
     def keys(self, *names: str) -> "list[Node]":
         """The entries of an object that must have these keys and the digests of their values."""
-        self.insist(isinstance(self.value, dict), "must be an object")
+        self.require(isinstance(self.value, dict), "must be an object")
         wrong = sorted({*names, "sha256"} ^ self.value.keys())
-        self.insist(not wrong, f"has unknown keys or lacks some: {', '.join(wrong)[:80]}")
+        self.require(not wrong, f"has unknown keys or lacks some: {', '.join(wrong)[:80]}")
         digests = self.value["sha256"]
-        Node(f"{self.place}.sha256", digests).insist(
+        Node(f"{self.place}.sha256", digests).require(
             isinstance(digests, dict) and digests.keys() == set(names), f"must be digests of {', '.join(names)}"
         )
         return [Node(f"{self.place}.{name}", self.value[name]) for name in names]
 
-    def sealed(self) -> None:
-        """Refuses values that are not those of the digests."""
-        for name, digest in self.value["sha256"].items():
-            if digest != seal(self.value[name]):
+    def require_digests(self) -> None:
+        """Refuses values that do not have the stored digests."""
+        for name, stored in self.value["sha256"].items():
+            if stored != digest(self.value[name]):
                 raise Damaged(f"{self.place}.{name}", "was changed: its digest is another")
 
-    def insist(self, holds: bool, reason: str) -> None:
-        insist(holds, self.place, reason)
+    def require(self, holds: bool, reason: str) -> None:
+        require(holds, self.place, reason)
 
     def items(self, count: int | None = None, at_least: int = 0) -> "list[Node]":
-        self.insist(isinstance(self.value, list), "must be a list")
+        self.require(isinstance(self.value, list), "must be a list")
         entries = len(self.value)
-        self.insist(count is None or entries == count, f"has {entries} entries, must have {count}")
-        self.insist(entries >= at_least, f"has {entries} entries, must have at least {at_least}")
+        self.require(count is None or entries == count, f"has {entries} entries, must have {count}")
+        self.require(entries >= at_least, f"has {entries} entries, must have at least {at_least}")
         return [Node(f"{self.place}[{i}]", v) for i, v in enumerate(self.value)]
 
     def number(self):
-        self.insist(
+        self.require(
             isinstance(self.value, str) and bool(_DOUBLE.fullmatch(self.value)), "must be a double in hexadecimal"
         )
         try:
@@ -71,7 +71,7 @@ class Node(NamedTuple):
 
     def integer(self, low: int, high: int) -> int:
         holds = type(self.value) is int and low <= self.value <= high
-        self.insist(holds, f"must be an integer from {low} to {high}")
+        self.require(holds, f"must be an integer from {low} to {high}")
         return self.value
 
     def array(self, *shape: int) -> Any:
@@ -88,7 +88,7 @@ class Node(NamedTuple):
         return full
 
 
-def seal(value: Any) -> str:
+def digest(value: Any) -> str:
     """The digest of a value of a file."""
     text = json.dumps(value, sort_keys=True, separators=(",", ":"), ensure_ascii=True)
     return hashlib.sha256(text.encode()).hexdigest()
@@ -97,21 +97,21 @@ def seal(value: Any) -> str:
 def read_claim(node: Node) -> Claim:
     names = ("plant", "parameters", "state_limits", "dt", "x", "rates", "u", "K", "x_goal", "K_goal", "start")
     entries = dict(zip(names, node.keys(*names), strict=True))
-    node.sealed()
-    entries["plant"].insist(entries["plant"].value in tuple(PLANTS), f"must be one of {', '.join(PLANTS)}")
+    node.require_digests()
+    entries["plant"].require(entries["plant"].value in tuple(PLANTS), f"must be one of {', '.join(PLANTS)}")
     plant = PLANTS[entries["plant"].value]
     n = len(plant.states)
     given = entries["parameters"]
-    given.insist(isinstance(given.value, dict) and given.value.keys() == set(plant.parameters), "must be the plant's")
+    given.require(isinstance(given.value, dict) and given.value.keys() == set(plant.parameters), "must be the plant's")
     parameters = {name: Node(f"{given.place}.{name}", given.value[name]).number() for name in plant.parameters}
     for name, value in parameters.items():
         must = ">= 0" if name in ("b", "Beq", "Bp") else "> 0"
         holds = value >= 0 if must == ">= 0" else value > 0
-        insist(holds, f"{given.place}.{name}", f"= {rounded(value):g}: must be {must}")
+        require(holds, f"{given.place}.{name}", f"= {rounded(value):g}: must be {must}")
     limits = entries["state_limits"].items(n)
     bounds = [None if limit.value is None else limit.number() for limit in limits]
     dt = entries["dt"].number()
-    entries["dt"].insist(dt > 0, "must be > 0")
+    entries["dt"].require(dt > 0, "must be > 0")
     knots = len(entries["x"].items(at_least=2))
     start = entries["start"].items(2)
     return Claim(
@@ -122,81 +122,86 @@ def read_claim(node: Node) -> Claim:
     )  # fmt: skip
 
 
-def read_cases(node: Node, n: int) -> dict[str, Witness]:
-    node.insist(isinstance(node.value, dict) and node.value.keys() <= {"free", "high", "low"}, "must be cases")
-    found = {}
+def read_cases(node: Node, n: int) -> dict[str, GramCertificate]:
+    node.require(isinstance(node.value, dict) and node.value.keys() <= {"free", "high", "low"}, "must be cases")
+    cases = {}
     for case, value in node.value.items():
         here = Node(f"{node.place}.{case}", value)
-        here.insist(isinstance(value, dict) and value.keys() == {"degree", "gram", "multipliers"}, "must be a witness")
+        holds = isinstance(value, dict) and value.keys() == {"degree", "gram", "multipliers"}
+        here.require(holds, "must have the keys degree, gram, multipliers")
         degree = Node(f"{here.place}.degree", value["degree"]).integer(1, MAX_ORDER // 2)
         rows, sides = len(monomials(n, degree)), len(monomials(n, degree - 1))
         grams = Node(f"{here.place}.gram", value["gram"]).items(at_least=1)
-        grams[0].insist(len(grams) <= 2 * MAX_ORDER, f"must have at most {2 * MAX_ORDER} matrices")
+        grams[0].require(len(grams) <= 2 * MAX_ORDER, f"must have at most {2 * MAX_ORDER} matrices")
         multipliers = Node(f"{here.place}.multipliers", value["multipliers"]).items()
-        found[case] = Witness(
+        cases[case] = GramCertificate(
             degree,
             [gram.symmetric(rows) for gram in grams],
             [[matrix.symmetric(sides) for matrix in each.items(at_least=1)] for each in multipliers],
         )
-    return found
+    return cases
 
 
 def require_few_terms(node: Node, n: int, s_order: int, y_order: int) -> None:
     """A polynomial of these orders in s and y must be small enough to be multiplied in seconds."""
     terms = (s_order + 1) * math.comb(y_order + n, n)
-    node.insist(terms <= MAX_TERMS, f"asks for polynomials of {terms} terms, must be at most {MAX_TERMS}")
+    node.require(terms <= MAX_TERMS, f"asks for polynomials of {terms} terms, must be at most {MAX_TERMS}")
 
 
-def read_stretch(node: Node, claim: Claim) -> Stretch:
+def read_interval(node: Node, claim: Claim) -> Interval:
     knot, start, end, first, last, bend, orders, cases = node.keys(
         "knot", "start", "end", "first", "last", "bend", "orders", "cases"
     )
-    node.sealed()
+    node.require_digests()
     n = claim.n
     pair = [order.integer(1, MAX_ORDER - 1) for order in orders.items(2)]
     require_few_terms(orders, n, *pair)
-    piece = Stretch(
+    interval = Interval(
         knot.integer(0, len(claim.u) - 1), start.number(), end.number(), first.array(n, n), last.array(n, n),
         bend.array(2, n, n), (pair[0], pair[1]), read_cases(cases, n),
     )  # fmt: skip
-    node.insist(0 <= piece.start < piece.end <= 1, "must start before it ends, at shares of its interval in [0, 1]")
-    return piece
+    node.require(
+        0 <= interval.start < interval.end <= 1, "must start before it ends, at fractions of its interval in [0, 1]"
+    )
+    return interval
 
 
 def _read_shell(node: Node, n: int) -> Shell:
     start, end, cases = node.keys("start", "end", "cases")
-    node.sealed()
+    node.require_digests()
     shell = Shell(start.number(), end.number(), read_cases(cases, n))
-    node.insist(0 <= shell.start < shell.end <= 1, "must have levels that rise within [0, 1]")
+    node.require(0 <= shell.start < shell.end <= 1, "must have levels that rise within [0, 1]")
     return shell
 
 
 def read_goal(node: Node, claim: Claim) -> tuple[list, int, Any, list[Shell]]:
-    """Axes, order of the Taylor models, weight of the S-lemma, and the shells, which cover the levels [0, 1]."""
+    """Axes, order of the Taylor models, weight of the S-lemma, and the shells. These cover the levels [0, 1]."""
     axes, order, weight, items = node.keys("axes", "order", "weight", "shells")
     shells, reached = [_read_shell(item, claim.n) for item in items.items(at_least=1)], Q(0)
-    node.sealed()
+    node.require_digests()
     for i, shell in enumerate(shells):
         place = f"{items.place}[{i}]"
-        insist(shell.start == reached, place, f"starts at {rounded(shell.start):g}, must start at {rounded(reached):g}")
+        require(
+            shell.start == reached, place, f"starts at {rounded(shell.start):g}, must start at {rounded(reached):g}"
+        )
         reached = shell.end
-    items.insist(reached == 1, f"ends at {rounded(reached):g}, must end at 1")
+    items.require(reached == 1, f"ends at {rounded(reached):g}, must end at 1")
     require_few_terms(order, claim.n, MAX_ORDER, order.integer(2, MAX_ORDER - 2))
     return axes.array(claim.n, claim.n), order.value, weight.number(), shells
 
 
 def read_notes(node: Node) -> dict[str, str]:
-    node.insist(isinstance(node.value, dict), "must be an object")
-    node.insist(len(node.value) <= MAX_NOTES, f"has {len(node.value)} entries, must have at most {MAX_NOTES}")
-    node.insist(all(isinstance(note, str) for note in node.value.values()), "must hold texts")
+    node.require(isinstance(node.value, dict), "must be an object")
+    node.require(len(node.value) <= MAX_NOTES, f"has {len(node.value)} entries, must have at most {MAX_NOTES}")
+    node.require(all(isinstance(note, str) for note in node.value.values()), "must hold texts")
     return node.value
 
 
 def _unique(pairs: list[tuple[str, Any]]) -> dict:
-    found = dict(pairs)
-    if len(found) != len(pairs):
+    entries = dict(pairs)
+    if len(entries) != len(pairs):
         raise Damaged("certificate", "has the same key twice")
-    return found
+    return entries
 
 
 def _no_constant(name: str) -> Any:

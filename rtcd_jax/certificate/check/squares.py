@@ -6,7 +6,7 @@ from functools import lru_cache
 from itertools import combinations_with_replacement
 from typing import Any, NamedTuple
 
-from rtcd_jax.certificate.check.exact import Q, insist, rounded
+from rtcd_jax.certificate.check.exact import Q, require, rounded
 from rtcd_jax.certificate.check.taylor import peak, terms_of
 
 
@@ -24,8 +24,11 @@ class Obligation(NamedTuple):
     high: Any
 
 
-class Witness(NamedTuple):
-    """`gram` [j] and `multipliers` [i][a], symmetric matrices, with monomials of y up to `degree` and `degree` - 1."""
+class GramCertificate(NamedTuple):
+    """`gram` [j] and `multipliers` [i][a], symmetric matrices: the G_j and S_ia of the theorem's proof.
+
+    Their monomials of y go up to `degree` and `degree` - 1.
+    """
 
     degree: int
     gram: list
@@ -35,13 +38,13 @@ class Witness(NamedTuple):
 @lru_cache(None)
 def monomials(n: int, degree: int) -> tuple[tuple[int, ...], ...]:
     """Exponents of y up to `degree`, by degree; on the sphere the last component needs no square."""
-    found = []
+    basis = []
     for order in range(degree + 1):
         for chosen in combinations_with_replacement(range(n), order):
             exponents = tuple(chosen.count(i) for i in range(n))
             if exponents[-1] < 2:
-                found.append(exponents)
-    return tuple(found)
+                basis.append(exponents)
+    return tuple(basis)
 
 
 @lru_cache(None)
@@ -72,7 +75,7 @@ def bernstein(p, degree: int, low, high, place: str) -> list[dict]:
     """Bernstein coefficients in s, each a polynomial in y on the sphere by exponents."""
     terms = terms_of(p)
     order = max((e[0] for e, _ in terms), default=0)
-    insist(order <= degree, place, f"order {order} in time needs more than {degree + 1} Bernstein polynomials")
+    require(order <= degree, place, f"order {order} in time needs more than {degree + 1} Bernstein polynomials")
     rows, parts = _basis_change(order, degree, low, high), [{} for _ in range(degree + 1)]
     for e, c in terms:
         for f, k in reduced(e[1:]):
@@ -110,42 +113,42 @@ def quadratic(matrix: Sequence[Sequence], basis: Sequence[tuple[int, ...]]) -> d
     return total
 
 
-def margin(todo: Obligation, witness: Witness, place: str):
+def margin(todo: Obligation, certificate: GramCertificate, place: str):
     """A lower bound > 0 of q where the obligation asks for it.
 
     Raises:
-        Refused: the witness does not show that.
+        Refused: the certificate does not show that.
     """
     n = len(next(iter(todo.p.to_dict()), (0, 0))) - 1
-    basis, sides = monomials(n, witness.degree), monomials(n, witness.degree - 1)
-    degree = len(witness.gram) - 1
+    basis, sides = monomials(n, certificate.degree), monomials(n, certificate.degree - 1)
+    degree = len(certificate.gram) - 1
     parts = bernstein(todo.p, degree, todo.low, todo.high, place)
-    insist(len(witness.multipliers) == len(todo.where), place, f"needs {len(todo.where)} multipliers")
-    for i, (g, multiplier) in enumerate(zip(todo.where, witness.multipliers, strict=True)):
+    require(len(certificate.multipliers) == len(todo.where), place, f"needs {len(todo.where)} multipliers")
+    for i, (g, multiplier) in enumerate(zip(todo.where, certificate.multipliers, strict=True)):
         _subtract_product(parts, g, multiplier, sides, todo, f"{place}.multipliers[{i}]")
     bound = None
-    for j, (part, gram) in enumerate(zip(parts, witness.gram, strict=True)):
-        _insist_definite(gram, len(basis), f"{place}.gram[{j}]")
+    for j, (part, gram) in enumerate(zip(parts, certificate.gram, strict=True)):
+        _require_definite(gram, len(basis), f"{place}.gram[{j}]")
         for e, c in quadratic(gram, basis).items():
             part[e] = part.get(e, 0) - c
         rest = part.pop((0,) * n, Q(0)) - sum((abs(c) * peak(e) for e, c in part.items()), Q(0)) - todo.error
-        insist(rest > 0, f"{place}.gram[{j}]", f"proves no decrease: at best {rounded(rest):.3g}, must be > 0")
+        require(rest > 0, f"{place}.gram[{j}]", f"proves no decrease: at best {rounded(rest):.3g}, must be > 0")
         bound = rest if bound is None else min(bound, rest)
     return bound
 
 
-def _insist_definite(matrix, rows: int, place: str) -> None:
-    insist(len(matrix) == rows, place, f"has {len(matrix)} rows, must have {rows}")
-    insist(is_positive_definite(matrix), place, "is not positive definite")
+def _require_definite(matrix, rows: int, place: str) -> None:
+    require(len(matrix) == rows, place, f"has {len(matrix)} rows, must have {rows}")
+    require(is_positive_definite(matrix), place, "is not positive definite")
 
 
 def _subtract_product(parts, g, multiplier, basis, todo: Obligation, place: str) -> None:
     """Takes sigma g from the Bernstein coefficients, sigma = sum_a B_a z'S_a z."""
     degree, high = len(parts) - 1, len(multiplier) - 1
-    insist(0 <= high <= degree, place, f"has {high + 1} matrices, must have 1 to {degree + 1}")
+    require(0 <= high <= degree, place, f"has {high + 1} matrices, must have 1 to {degree + 1}")
     factors = bernstein(g, degree - high, todo.low, todo.high, place)
     for a, matrix in enumerate(multiplier):
-        _insist_definite(matrix, len(basis), f"{place}[{a}]")
+        _require_definite(matrix, len(basis), f"{place}[{a}]")
         square = quadratic(matrix, basis)
         for b, factor in enumerate(factors):
             weight = Q(math.comb(high, a) * math.comb(degree - high, b), math.comb(degree, a + b))

@@ -1,11 +1,11 @@
-"""Functions of time and of a point in the unit ball: polynomials with a bound of what they leave out."""
+"""Taylor models: functions of time and of a point in the unit ball as polynomials with bounds of their remainders."""
 
 import math
 from collections.abc import Mapping, Sequence
 from functools import lru_cache
 from typing import Any, NamedTuple
 
-from rtcd_jax.certificate.check.exact import BITS, Q, flint, insist, near, root_up, up
+from rtcd_jax.certificate.check.exact import BITS, Q, flint, near, require, root_up, up
 
 # Polynomials in (s, y_1 .. y_n) ---------------------------------------------------------------------------------------
 
@@ -105,7 +105,7 @@ class Taylor:
 
     def tidy(self) -> "Taylor":
         """The same function without terms of high order, its coefficients rounded."""
-        kept, r, d = {}, self.r, self.d
+        terms, r, d = {}, self.r, self.d
         for e, c in terms_of(self.p):
             order = sum(e[1:])
             if e[0] > self.space.s_order or order > self.space.y_order:
@@ -117,8 +117,8 @@ class Taylor:
             elif error != 0:
                 d += error
             if coefficient != 0:
-                kept[e] = coefficient
-        return Taylor(self.space, polynomial(self.space.n, kept), up(r), up(d))
+                terms[e] = coefficient
+        return Taylor(self.space, polynomial(self.space.n, terms), up(r), up(d))
 
     @property
     def constant(self):
@@ -189,7 +189,7 @@ def sine_and_cosine(angle: Taylor, center, values: tuple, place: str) -> tuple[T
     space = angle.space
     x = Taylor(space, angle.p - space.poly(center))
     radius = up(size(x.p), 20)
-    insist(0 < radius <= 8, place, "the funnel is wider than 8 rad")
+    require(0 < radius <= 8, place, "the funnel is wider than 8 rad")
     squared, tail = x * x, radius**_LONG / Q(math.factorial(_LONG + 1))
     parts = []
     for series, first in ((_SINE, 0), (_COSINE, 1)):

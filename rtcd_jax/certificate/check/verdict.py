@@ -1,4 +1,4 @@
-"""The whole: every obligation of a certificate shown, and what that proves."""
+"""Every obligation of a certificate, and what follows when all of them hold."""
 
 import math
 from collections.abc import Callable, Mapping, Sequence
@@ -6,21 +6,21 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from rtcd_jax.certificate.check.claim import Claim
-from rtcd_jax.certificate.check.exact import Damaged, Q, Undecided, insist, root_up, rounded
+from rtcd_jax.certificate.check.exact import Damaged, Q, Undecided, require, root_up, rounded
 from rtcd_jax.certificate.check.file import (
     Node,
+    digest,
     parse,
     read_bytes,
     read_claim,
     read_goal,
+    read_interval,
     read_notes,
-    read_stretch,
-    seal,
 )
-from rtcd_jax.certificate.check.funnel import Stretch, funnel_obligations, insist_bounds, motion
-from rtcd_jax.certificate.check.goal import goal_field, goal_obligations, insist_arrival
+from rtcd_jax.certificate.check.funnel import Interval, funnel_obligations, motion, require_bounds
+from rtcd_jax.certificate.check.goal import goal_field, goal_obligations, require_arrival
 from rtcd_jax.certificate.check.matrix import cofactors, dot
-from rtcd_jax.certificate.check.squares import Obligation, Witness, margin
+from rtcd_jax.certificate.check.squares import GramCertificate, Obligation, margin
 from rtcd_jax.certificate.check.taylor import terms_of
 
 FORMAT, VERSION = "rtcd certificate", 1
@@ -34,7 +34,7 @@ class Report(NamedTuple):
 
     claim: Claim
     digest: str
-    stretches: int
+    intervals: int
     shells: int
     start: float
     end: float
@@ -45,29 +45,29 @@ class Report(NamedTuple):
     notes: dict[str, str]
 
 
-def margins(todo: Mapping[str, Obligation], cases: Mapping[str, Witness], place: str) -> dict[str, Any]:
-    """Margin by case; refused unless there is a witness for exactly the cases that can occur."""
-    insist(todo.keys() == cases.keys(), place, f"must have the cases {', '.join(todo)}, has {', '.join(cases)}")
+def margins(todo: Mapping[str, Obligation], cases: Mapping[str, GramCertificate], place: str) -> dict[str, Any]:
+    """Margin by case; refused unless there is a Gram certificate for exactly the cases that can occur."""
+    require(todo.keys() == cases.keys(), place, f"must have the cases {', '.join(todo)}, has {', '.join(cases)}")
     return {case: margin(todo[case], cases[case], f"{place}.{case}") for case in todo}
 
 
-def check_stretch(claim: Claim, piece: Stretch, place: str):
+def check_interval(claim: Claim, interval: Interval, place: str):
     """The margin of one interval's proof."""
-    insist_bounds(claim, motion(claim, piece), place)
-    return min(margins(funnel_obligations(claim, piece, place), piece.cases, f"{place}.cases").values())
+    require_bounds(claim, motion(claim, interval), place)
+    return min(margins(funnel_obligations(claim, interval, place), interval.cases, f"{place}.cases").values())
 
 
-def check_chain(claim: Claim, pieces: Sequence[Stretch], place: str) -> None:
+def check_chain(claim: Claim, intervals: Sequence[Interval], place: str) -> None:
     """The intervals cover [start, t_N] without gap or overlap, and their ellipsoids join."""
     reached, axes = claim.start, None
-    for i, piece in enumerate(pieces):
-        here, at, begins = f"{place}[{i}]", reached[0] + reached[1], piece.knot + piece.start
+    for i, interval in enumerate(intervals):
+        here, at, begins = f"{place}[{i}]", reached[0] + reached[1], interval.knot + interval.start
         where = f"starts at {rounded(begins):.17g} knots, must start at {rounded(at):.17g}"
-        insist(begins <= at, here, f"leaves a gap: {where}")
-        insist(begins == at, here, f"overlaps: {where}")
-        insist(axes is None or axes == piece.first, f"{here}.first", "is not where the interval before it ends")
-        reached, axes = (piece.knot, piece.end), piece.last
-    insist(reached[0] + reached[1] == len(claim.u), place, "does not reach the last knot")
+        require(begins <= at, here, f"leaves a gap: {where}")
+        require(begins == at, here, f"overlaps: {where}")
+        require(axes is None or axes == interval.first, f"{here}.first", "is not where the interval before it ends")
+        reached, axes = (interval.knot, interval.end), interval.last
+    require(reached[0] + reached[1] == len(claim.u), place, "does not reach the last knot")
 
 
 def check_goal(claim: Claim, node: Node, outlet: list) -> tuple[list, list, int, Any]:
@@ -75,18 +75,18 @@ def check_goal(claim: Claim, node: Node, outlet: list) -> tuple[list, list, int,
     axes, order, weight, shells = read_goal(node, claim)
     for i, bound in enumerate(claim.bounds):
         left = None if bound is None else bound - abs(claim.x_goal[i])
-        kept = left is None or (left > 0 and left * left > dot(axes[i], axes[i]))
-        insist(kept, f"{node.place}.axes", f"the limit on |{claim.plant.states[i]}| is not kept")
+        inside = left is None or (left > 0 and left * left > dot(axes[i], axes[i]))
+        require(inside, f"{node.place}.axes", f"the limit on |{claim.plant.states[i]}| is not kept")
     field = goal_field(claim, axes, order, node.place)
-    insist_arrival(claim, outlet, axes, weight, f"{node.place}.axes")
+    require_arrival(claim, outlet, axes, weight, f"{node.place}.axes")
     least, drift = None, Q(0)
     for i, shell in enumerate(shells):
         todo = goal_obligations(claim, field, shell.start, shell.end)
-        found = min(margins(todo, shell.cases, f"{node.place}.shells[{i}].cases").values())
-        least = found if least is None else min(least, found)
+        smallest = min(margins(todo, shell.cases, f"{node.place}.shells[{i}].cases").values())
+        least = smallest if least is None else min(least, smallest)
         drift = max(drift, *(each.drift for each in todo.values()))
     rest = drift / least
-    insist(rest < 1, node.place, "the rounding of the goal is too large for a proof")
+    require(rest < 1, node.place, "the rounding of the goal is too large for a proof")
     return axes, [rest * root_up(dot(row, row)) for row in axes], len(shells), least
 
 
@@ -107,28 +107,28 @@ def check(content: Any, progress: Callable[[int, int], None] = lambda done, of: 
 
 def _check(content: Any, progress: Callable[[int, int], None]) -> Report:
     top = Node("certificate", content)
-    top.insist(isinstance(content, dict), "must be an object")
-    top.insist(content.get("format") == FORMAT, f"is no {FORMAT!r}")
-    top.insist(type(content.get("version")) is int and content["version"] == VERSION, f"must be of version {VERSION}")
+    top.require(isinstance(content, dict), "must be an object")
+    top.require(content.get("format") == FORMAT, f"is no {FORMAT!r}")
+    top.require(type(content.get("version")) is int and content["version"] == VERSION, f"must be of version {VERSION}")
     _, _, about, funnel, goal, notes = top.keys("format", "version", "claim", "funnel", "goal", "notes")
     texts, claim = read_notes(notes), read_claim(about)
-    pieces = [read_stretch(item, claim) for item in funnel.items(at_least=1)]
-    check_chain(claim, pieces, funnel.place)
-    l_goal, rest, shells, least = check_goal(claim, goal, pieces[-1].last)
-    for i, piece in enumerate(pieces):
-        least = min(least, check_stretch(claim, piece, f"{funnel.place}[{i}]"))
-        progress(i + 1, len(pieces))
-    top.sealed()
-    volumes, axes = volumes_of(claim, pieces, l_goal)
+    intervals = [read_interval(item, claim) for item in funnel.items(at_least=1)]
+    check_chain(claim, intervals, funnel.place)
+    l_goal, rest, shells, least = check_goal(claim, goal, intervals[-1].last)
+    for i, interval in enumerate(intervals):
+        least = min(least, check_interval(claim, interval, f"{funnel.place}[{i}]"))
+        progress(i + 1, len(intervals))
+    top.require_digests()
+    volumes, axes = volumes_of(claim, intervals, l_goal)
     begin = rounded((claim.start[0] + claim.start[1]) * claim.dt)
     return Report(
-        claim, seal(about.value), len(pieces), shells, begin, rounded(len(claim.u) * claim.dt), volumes, axes,
+        claim, digest(about.value), len(intervals), shells, begin, rounded(len(claim.u) * claim.dt), volumes, axes,
         [rounded(r) for r in rest], rounded(least), texts,
     )  # fmt: skip
 
 
 def volumes_of(
-    claim: Claim, pieces: Sequence[Stretch], l_goal: list
+    claim: Claim, intervals: Sequence[Interval], l_goal: list
 ) -> tuple[dict[str, float], dict[str, list[float]]]:
     """Volumes |unit ball| det L, and half widths of the ellipsoids along each state."""
     ball = math.pi ** (claim.n / 2) / math.gamma(claim.n / 2 + 1)
@@ -139,17 +139,17 @@ def volumes_of(
     def widths(axes) -> list[float]:
         return [rounded(root_up(dot(row, row))) for row in axes]
 
-    knots = [volume(piece.first) for piece in pieces if piece.start == 0] + [volume(pieces[-1].last)]
+    knots = [volume(interval.first) for interval in intervals if interval.start == 0] + [volume(intervals[-1].last)]
     integral = Q(0)
-    for piece in pieces:
-        data = motion(claim, piece)
+    for interval in intervals:
+        data = motion(claim, interval)
         powers = {e[0]: c for e, c in terms_of(cofactors(data.axes)[1])}
         integral += sum((c / (k + 1) for k, c in powers.items() if k % 2 == 0), Q(0)) * data.duration
     volumes = {
-        "sum": _sum(knots), "integral": ball * rounded(integral), "inlet": volume(pieces[0].first),
+        "sum": _sum(knots), "integral": ball * rounded(integral), "inlet": volume(intervals[0].first),
         "outlet": knots[-1], "goal": volume(l_goal),
     }  # fmt: skip
-    return volumes, {"inlet": widths(pieces[0].first), "outlet": widths(pieces[-1].last), "goal": widths(l_goal)}
+    return volumes, {"inlet": widths(intervals[0].first), "outlet": widths(intervals[-1].last), "goal": widths(l_goal)}
 
 
 def _sum(values: Sequence[float]) -> float:
@@ -170,16 +170,16 @@ def sentence(name: str, report: Report) -> str:
         return f"{place} " + ", ".join(f"{state} +-{value:.3g} {unit}" for state, value, unit in triples)
 
     limits = [(s, b, u) for s, b, u in zip(plant.states, claim.bounds, plant.units, strict=True) if b is not None]
-    kept = " and ".join(f"|{state}| <= {float(bound):.6g} {unit}" for state, bound, unit in limits)
+    bounds = " and ".join(f"|{state}| <= {float(bound):.6g} {unit}" for state, bound, unit in limits)
     return (
         f"PROVED in continuous time, by exact arithmetic, for the model {name!r} ({numbers}; SI units) under the "
         f"claimed controller, whose input never exceeds {float(claim.limit):.6g} {plant.input_unit}: every motion that "
         f"is in the funnel at some time of [{report.start:.6g} s, {report.end:.6g} s] stays in it, is in the goal "
         f"region at {report.end:.6g} s, never leaves that region, and converges to within "
-        f"{max(report.rest):.1g} of the goal in every state; {kept or 'there is no limit on a state'} all the while. "
+        f"{max(report.rest):.1g} of the goal in every state; {bounds or 'there is no limit on a state'} all the while. "
         f"Half widths: {extent('inlet')}; {extent('outlet')}; {extent('goal')}. Volumes (proved) [{unit}]: inlet "
         f"{v['inlet']:.6g}, sum over the knots {v['sum']:.6g}, integral over time {v['integral']:.6g} s, goal region "
-        f"{v['goal']:.6g}. {report.stretches} intervals of time and {report.shells} of level, smallest margin "
+        f"{v['goal']:.6g}. {report.intervals} intervals of time and {report.shells} of level, smallest margin "
         f"{report.margin:.2g}. It is a statement about this model, its state known exactly and its input "
         f"applied without sampling, not about hardware. Claim: sha256 {report.digest}."
     )

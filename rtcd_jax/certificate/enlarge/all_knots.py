@@ -1,16 +1,16 @@
-"""The value function that has the largest funnel: all its ellipsoids at once, the goal region's among them.
+"""The value function with the largest funnel: all its ellipsoids at once, the goal region's among them.
 
 V = e'P e with P free at every knot, and its rate free at both ends of every interval: between them P is the cubic
 Hermite interpolant, as TVLQR's own is. The program is
 
     maximize    log (integral of det P^-1/2 over time) + INLET log (det P^-1/2 at t = 0)
-    such that   V' <= -spare V  wherever V = 1, and for all V <= 1 at the goal,
+    such that   V' <= -decay_margin V  wherever V = 1, and for all V <= 1 at the goal,
                 {V <= 1} keeps the limits on the states.
 
 It is solved as a sequence of linear programs. V' is asked for at sampled instants and directions e of the present
 ellipsoids, and is linearized in P: where P changes by dP, the boundary point e moves to (1 + r) e with
-r = -e'dP e / 2. What the linearization misses is made good by levels: they are carried back from the goal as in a proof
-with a given V, so that every iterate is a funnel, its volume known. A step is taken if the objective grows. (Tobenkin,
+r = -e'dP e / 2. Levels that are carried back from the goal, as in a proof with a given V, correct the error of
+the linearization. So every iterate is a funnel of known volume. A step is taken if the objective grows. (Tobenkin,
 Manchester, Tedrake 2011 alternate between multipliers and V to the same end.)
 """
 
@@ -20,24 +20,24 @@ import numpy as np
 import scipy.sparse as sp
 from scipy.optimize import linprog
 
-from rtcd_jax.certificate.check import Refused, insist
+from rtcd_jax.certificate.check import Refused, require
 from rtcd_jax.certificate.prove.closed_loop import Loop, hermite
 from rtcd_jax.certificate.prove.levels import (
+    DECAY_MARGIN,
+    FRACTION_OF_LIMIT,
+    FRACTIONS,
     INLET,
-    SHARE_OF_LIMIT,
-    SHARES,
-    SPARED,
-    directions,
     integral,
     leveled,
     lower_pairs,
     merit,
     products,
+    unit_directions,
     values_at,
 )
 
 LEVELS = np.linspace(0.1, 1, 10)
-"""Where it is asked for at the goal: |y|."""
+"""Levels |y| of the goal region at which V must fall."""
 TRUST = (0.3, 0.4, 0.01)
 """Largest change of an entry of P in units of the ellipsoid: at first, ever, and where the search ends."""
 BENDING = 4.0
@@ -45,21 +45,21 @@ BENDING = 4.0
 ROUNDS = 40
 WIDEST = 3.0
 """Largest half width [rad] along the angle: beyond it polynomials follow the sine badly."""
-THINNED = 8
-"""The linear programs get one of so many directions,"""
-KEPT = 40
-"""and at every instant no more than so many, those where V falls least."""
+DIRECTION_STRIDE = 8
+"""Stride of the directions in the linear programs."""
+DIRECTIONS_PER_INSTANT = 40
+"""Most directions of an instant in a linear program: those in which V falls least."""
 WORTH = 1e-3
-"""What a step must gain, or the next one is shorter."""
+"""Gain of a step below which the next one is shorter."""
 STEP = 0.01
-"""Of the differences by which the loop's rate along a direction is found."""
+"""Of the differences that give the loop's rate along a direction."""
 
 
-def enlarged(best: Loop, aims: np.ndarray) -> Loop:
-    """The funnel after all steps that gained; `aims`: directions [n D] by which levels are carried back."""
+def enlarged(best: Loop, directions: np.ndarray) -> Loop:
+    """The funnel after all steps that gained. Levels are carried back along the `directions` [n D]."""
     trust, most, finest = TRUST
     for _ in range(ROUNDS):
-        tried = _step(best, trust, aims)
+        tried = _step(best, trust, directions)
         gain = -np.inf if tried is None else merit(tried) - merit(best)
         if tried is not None and gain > 0:
             best = tried
@@ -69,10 +69,10 @@ def enlarged(best: Loop, aims: np.ndarray) -> Loop:
     return best
 
 
-def _step(loop: Loop, trust: float, aims: np.ndarray) -> Loop | None:
+def _step(loop: Loop, trust: float, directions: np.ndarray) -> Loop | None:
     """The funnel after one linear program; None if there is none."""
     try:
-        return leveled(changed(loop, trust), aims)
+        return leveled(changed(loop, trust), directions)
     except (Refused, np.linalg.LinAlgError):
         return None
 
@@ -81,22 +81,22 @@ def changed(loop: Loop, trust: float) -> Loop:
     """The loop after one linear program: a funnel up to what is of second order in `trust`.
 
     Raises:
-        Refused: the solver found no solution.
+        Refused: the solver has no solution.
     """
     program = Program(loop, trust)
     rows = [program.falling(), program.falling_at_goal(), program.within_limits()]
-    table, room = sp.vstack([each.table for each in rows]), np.concatenate([each.room for each in rows])
-    reach = np.stack([-program.reach, program.reach], axis=1)
-    found = linprog(-program.gain(), table, np.maximum(room, 0), bounds=reach)  # no change is always a solution
-    insist(found.status == 0, "funnel", "the linear program was not solved")
-    return program.changed(found.x)
+    table, bound = sp.vstack([each.table for each in rows]), np.concatenate([each.bound for each in rows])
+    radius = np.stack([-program.radius, program.radius], axis=1)
+    solution = linprog(-program.gain(), table, np.maximum(bound, 0), bounds=radius)  # no change is always a solution
+    require(solution.status == 0, "funnel", "the linear program was not solved")
+    return program.changed(solution.x)
 
 
 class Rows(NamedTuple):
-    """Inequalities: table [R C] times the unknowns <= room [R]."""
+    """Inequalities: table [R C] times the unknowns <= bound [R]."""
 
     table: Any
-    room: np.ndarray
+    bound: np.ndarray
 
 
 @final
@@ -105,7 +105,7 @@ class Program:
 
     Unknown are the changes of P at the N + 1 knots and of its rates at both ends of the N intervals, all as symmetric
     X: L^-T X L^-1 with the L of that knot, the rates' by the time of an interval. P on an interval is made of four of
-    them, `blocks` [N 4], with `weights` [T 4], P' with `rates` [T 4].
+    them, `blocks` [N 4], with `weights` [T 4], P' with `rates` [T 4]. `radius` [C] bounds the unknowns' size.
     """
 
     def __init__(self, loop: Loop, trust: float):
@@ -114,61 +114,61 @@ class Program:
         self.axes = np.linalg.cholesky(np.linalg.inv(self.value))
         self.units = np.linalg.inv(np.linalg.cholesky(np.linalg.inv(loop.values)))
         self.blocks = np.stack([knots, n + 1 + 2 * knots, knots + 1, n + 2 + 2 * knots], axis=1)
-        basis = [hermite(SHARES, 1.0, *row) for row in np.eye(4)]
+        basis = [hermite(FRACTIONS, 1.0, *row) for row in np.eye(4)]
         self.weights = np.stack([weight for weight, _ in basis], axis=1)
         self.rates = np.stack([rate for _, rate in basis], axis=1) / loop.dt
         self.pairs = lower_pairs(loop.n)
-        self.reach = trust * np.repeat([1.0, BENDING], [(n + 1) * len(self.pairs), 2 * n * len(self.pairs)])
+        self.radius = trust * np.repeat([1.0, BENDING], [(n + 1) * len(self.pairs), 2 * n * len(self.pairs)])
 
     def falling(self) -> Rows:
-        """V' <= -spare on the boundaries, in those directions where it falls least."""
-        error = self.axes @ directions(self.loop.n)[:, ::THINNED]
-        v, e, motion, stretch = _decrease(self.value, self.slope, error, self._error_rates)
-        worst = np.argsort(-v, axis=-1)[..., :KEPT]
-        v, stretch = np.take_along_axis(v, worst, -1), np.take_along_axis(stretch, worst, -1)
+        """V' <= -decay margin on the boundaries, in those directions in which it falls least."""
+        error = self.axes @ unit_directions(self.loop.n)[:, ::DIRECTION_STRIDE]
+        v, e, motion, radial = _decrease(self.value, self.slope, error, self._error_rates)
+        worst = np.argsort(-v, axis=-1)[..., :DIRECTIONS_PER_INSTANT]
+        v, radial = np.take_along_axis(v, worst, -1), np.take_along_axis(radial, worst, -1)
         e, motion = (np.take_along_axis(each, worst[..., None, :], -1) for each in (e, motion))
         parts = []
         for knot in (self.units[:-1, None], self.units[1:, None]):
             p = knot @ e
             moved = products(p, p)
-            parts.append((2 * products(p, knot @ motion) - stretch[..., None] / 2 * moved, moved))
+            parts.append((2 * products(p, knot @ motion) - radial[..., None] / 2 * moved, moved))
         coefficients = [
             self.weights[:, None, None, j] * parts[j // 2][0] + self.rates[:, None, None, j] * parts[j // 2][1]
             for j in range(4)
         ]
-        return self._rows(np.stack(coefficients, axis=-2), self.blocks[:, None, None], -SPARED - v)
+        return self._rows(np.stack(coefficients, axis=-2), self.blocks[:, None, None], -DECAY_MARGIN - v)
 
     def falling_at_goal(self) -> Rows:
         """The same on ellipsoids within the last one, in the loop of the goal."""
-        value, unit, y = self.loop.values[-1], self.units[-1], directions(self.loop.n)[:, ::THINNED]
+        value, unit, y = self.loop.values[-1], self.units[-1], unit_directions(self.loop.n)[:, ::DIRECTION_STRIDE]
         level = LEVELS[:, None, None]
-        v, e, motion, stretch = _decrease(
+        v, e, motion, radial = _decrease(
             value, np.zeros_like(value), level * np.linalg.solve(unit, y), self._goal_rates
         )
-        coefficients = 2 * products(unit @ e, unit @ motion) - stretch[..., None] / 2 * products(y, y)
-        room = -SPARED * level[..., 0] ** 2 - v
-        return self._rows(coefficients[..., None, :], np.array([len(self.loop.u)]), room)
+        coefficients = 2 * products(unit @ e, unit @ motion) - radial[..., None] / 2 * products(y, y)
+        bound = -DECAY_MARGIN * level[..., 0] ** 2 - v
+        return self._rows(coefficients[..., None, :], np.array([len(self.loop.u)]), bound)
 
     def within_limits(self) -> Rows:
         """Half widths along the states: the diagonal of P^-1 is at most their squares."""
-        rooms = SHARE_OF_LIMIT * (self.loop.bounds - np.abs(self._nominal()[0]))
+        clearance = FRACTION_OF_LIMIT * (self.loop.bounds - np.abs(self._nominal()[0]))
         angle = self.loop.plant.angle
-        rooms[..., angle] = np.minimum(rooms[..., angle], WIDEST)
-        bounded = np.flatnonzero(np.isfinite(rooms[0, 0]))
+        clearance[..., angle] = np.minimum(clearance[..., angle], WIDEST)
+        bounded = np.flatnonzero(np.isfinite(clearance[0, 0]))
         spread = np.linalg.inv(self.value)
         widths = np.diagonal(spread, axis1=-2, axis2=-1)[..., bounded]
         p = [knot @ spread[..., bounded] for knot in (self.units[:-1, None], self.units[1:, None])]
         moved = [products(each, each) for each in p]
         coefficients = [-self.weights[:, None, None, j] * moved[j // 2] for j in range(4)]
-        room = rooms[..., bounded] ** 2 - widths
-        return self._rows(np.stack(coefficients, axis=-2), self.blocks[:, None, None], room)
+        bound = clearance[..., bounded] ** 2 - widths
+        return self._rows(np.stack(coefficients, axis=-2), self.blocks[:, None, None], bound)
 
     def gain(self) -> np.ndarray:
         """What the merit gains by the unknowns, to first order."""
-        times = np.gradient(SHARES) * self.loop.dt
+        times = np.gradient(FRACTIONS) * self.loop.dt
         times[[0, -1]] /= 2
         density = -times * np.linalg.det(self.axes) / 2
-        total = np.zeros((len(self.reach) // len(self.pairs), len(self.pairs)))
+        total = np.zeros((len(self.radius) // len(self.pairs), len(self.pairs)))
         for j in range(4):
             p = self.units[j // 2 : len(self.blocks) + j // 2, None] @ self.axes
             shrinks = products(p, p).sum(axis=-2)
@@ -191,12 +191,12 @@ class Program:
     def _nominal(self) -> tuple[np.ndarray, np.ndarray]:
         """x* and x*' [N T n]."""
         x, rates = self.loop.x[:, None], self.loop.rates
-        return hermite(SHARES[:, None], self.loop.dt, x[:-1], rates[:, None, 0], x[1:], rates[:, None, 1])
+        return hermite(FRACTIONS[:, None], self.loop.dt, x[:-1], rates[:, None, 0], x[1:], rates[:, None, 1])
 
     def _error_rates(self, error: np.ndarray) -> np.ndarray:
         """e' for errors e [N T n D] from the nominal motion."""
-        loop, (center, rate), share = self.loop, self._nominal(), SHARES[:, None]
-        gain = (1 - share) * loop.gains[:-1, None] + share * loop.gains[1:, None]
+        loop, (center, rate), fraction = self.loop, self._nominal(), FRACTIONS[:, None]
+        gain = (1 - fraction) * loop.gains[:-1, None] + fraction * loop.gains[1:, None]
         u = loop.u[:, None, None] - np.sum(gain[..., None] * error, axis=-2)
         motion = loop.rate(np.moveaxis(center[..., None] + error, -2, 0), np.clip(u, -loop.limit, loop.limit))
         return np.moveaxis(motion, 0, -2) - rate[..., None]
@@ -207,16 +207,16 @@ class Program:
         u = np.clip(-loop.goal_gain @ error, -loop.limit, loop.limit)
         return np.moveaxis(loop.rate(np.moveaxis(loop.goal[:, None] + error, -2, 0), u), 0, -2)
 
-    def _rows(self, coefficients: np.ndarray, blocks: np.ndarray, room: np.ndarray) -> Rows:
-        """Those inequalities, coefficients [... B m] of the unknowns `blocks` [... B], that the program can break."""
-        m, unknowns = len(self.pairs), len(self.reach)
-        columns = np.broadcast_to((blocks[..., None] * m + np.arange(m)), coefficients.shape).reshape(room.size, -1)
-        coefficients, room = coefficients.reshape(room.size, -1), room.ravel()
-        near = np.sum(np.abs(coefficients) * self.reach[columns], axis=1) > room
+    def _rows(self, coefficients: np.ndarray, blocks: np.ndarray, bound: np.ndarray) -> Rows:
+        """Those inequalities, coefficients [... B m] of the unknowns `blocks` [... B], that can become active."""
+        m, unknowns = len(self.pairs), len(self.radius)
+        columns = np.broadcast_to((blocks[..., None] * m + np.arange(m)), coefficients.shape).reshape(bound.size, -1)
+        coefficients, bound = coefficients.reshape(bound.size, -1), bound.ravel()
+        near = np.sum(np.abs(coefficients) * self.radius[columns], axis=1) > bound
         count = int(near.sum())
         starts = np.arange(count + 1) * columns.shape[1]
         table = sp.csr_matrix((coefficients[near].ravel(), columns[near].ravel(), starts), shape=(count, unknowns))
-        return Rows(table, room[near])
+        return Rows(table, bound[near])
 
 
 def _decrease(value: np.ndarray, slope: np.ndarray, error: np.ndarray, rates: Any) -> tuple[np.ndarray, ...]:

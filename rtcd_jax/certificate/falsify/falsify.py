@@ -1,6 +1,6 @@
-"""`rtcd falsify`: does any of a great many simulated motions break what a certificate says?
+"""`rtcd falsify`: simulates many motions and counts those that contradict a certificate.
 
-A proof that is right is not falsified; a prover, a checker and a model that share a mistake would be.
+No motion contradicts a correct proof. A mistake that prover, checker and model share would show.
 """
 
 import hashlib
@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rtcd_jax.certificate.falsify.simulation import REPEATED, Motions, Seen
+from rtcd_jax.certificate.falsify.simulation import REPEATED, MotionResults, Motions
 from rtcd_jax.system.console import Clock, Console, Progress
 from rtcd_jax.system.journal import Journal
 from rtcd_jax.system.processes import processes
@@ -25,7 +25,7 @@ TOLERANCE = 1e-5
 ROUNDING = 1e-12
 
 
-class Found(NamedTuple):
+class Summary(NamedTuple):
     """Counts of motions, by what they broke, and the extremes of all.
 
     `allowance` is what |y| may exceed 1 by: twice the largest difference that halved steps made, and rounding.
@@ -61,19 +61,19 @@ class Part(NamedTuple):
     not_arrived: int
 
     @classmethod
-    def of(cls, seen: Seen) -> "Part":
-        level, share, growth = seen.level, seen.share_of_limit, seen.growth
+    def of(cls, results: MotionResults) -> "Part":
+        level, share, growth = results.level, results.share_of_limit, results.growth
         levels, shares, growths = level[~(level <= 1)], share[~(share <= 1)], growth[~(growth <= 0)]
         return cls(
-            len(level), float(level.max()), float(share.max()), float(seen.error),
-            levels.tolist(), shares.tolist(), growths.tolist(), int(np.sum(~seen.arrived)),
+            len(level), float(level.max()), float(share.max()), float(results.error),
+            levels.tolist(), shares.tolist(), growths.tolist(), int(np.sum(~results.arrived)),
         )  # fmt: skip
 
 
 def falsify_file(path: Path, rollouts: int, seed: int, workers: int, console: Console) -> bool:
     """Simulates `rollouts` motions of a certificate; True if none broke it. The workers' number changes nothing.
 
-    What was finished before a kill is kept beside the certificate, and is not done again.
+    A journal beside the certificate keeps finished parts: after a kill the same command goes on.
 
     Raises:
         UserError: no certificate, or a folder that cannot be written.
@@ -83,19 +83,19 @@ def falsify_file(path: Path, rollouts: int, seed: int, workers: int, console: Co
     head = {"certificate": digest, "rollouts": rollouts, "seed": seed, "chunk": CHUNK}
     journal = Journal(path.with_name(f".{path.stem}.falsify.jsonl"), head)
     steps = enough_steps(motions, seed)
-    kept = len(journal.lines)
+    finished = len(journal.lines)
     parts = [Part(**line) for line in journal.lines]
     clock = Clock(before=sum(part.rollouts for part in parts))
-    for part in _parts(path, rollouts, seed, steps, workers, kept):
+    for part in _parts(path, rollouts, seed, steps, workers, finished):
         journal.append(part._asdict())
         parts.append(part)
         done, level = sum(each.rollouts for each in parts), max(each.level for each in parts)
         text = f"{done}/{rollouts} motions  largest |y| {level:.9f}  {clock.times(done, rollouts)}"
         console.progress(Progress(done, rollouts, text))
     journal.close()
-    found = summed(parts, steps)
-    console.message(sentence(motions, found))
-    return found.broken == 0
+    summary = summed(parts, steps)
+    console.message(sentence(motions, summary))
+    return summary.broken == 0
 
 
 def enough_steps(motions: Motions, seed: int) -> int:
@@ -106,13 +106,13 @@ def enough_steps(motions: Motions, seed: int) -> int:
     return steps
 
 
-def _parts(path: Path, rollouts: int, seed: int, steps: int, workers: int, kept: int) -> Iterator[Part]:
-    """The parts in their order, from the first one that is not kept."""
-    sizes = [min(CHUNK, rollouts - start) for start in range(0, rollouts, CHUNK)][kept:]
+def _parts(path: Path, rollouts: int, seed: int, steps: int, workers: int, finished: int) -> Iterator[Part]:
+    """The parts in their order, from the first unfinished one."""
+    sizes = [min(CHUNK, rollouts - start) for start in range(0, rollouts, CHUNK)][finished:]
     if not sizes:
         return
     with processes(min(workers, len(sizes)), _remember, path) as pool:
-        seeds = [(seed, kept + i) for i in range(len(sizes))]
+        seeds = [(seed, finished + i) for i in range(len(sizes))]
         yield from pool.map(_work, sizes, seeds, [steps] * len(sizes))
 
 
@@ -129,7 +129,7 @@ def _work(count: int, seed: tuple[int, int], steps: int) -> Part:
     return Part.of(_motions.follow(count, steps, np.random.default_rng(seed)))
 
 
-def summed(parts: list[Part], steps: int) -> Found:
+def summed(parts: list[Part], steps: int) -> Summary:
     """All parts together."""
     error = max(each.error for each in parts)
     allowance = 2 * error + ROUNDING
@@ -137,7 +137,7 @@ def summed(parts: list[Part], steps: int) -> Found:
     def beyond(values: Iterable[list[float]], bound: float) -> int:
         return sum(not value <= bound + allowance for each in values for value in each)
 
-    return Found(
+    return Summary(
         rollouts=sum(each.rollouts for each in parts),
         steps=steps,
         left_funnel=beyond((each.levels for each in parts), 1),
@@ -151,15 +151,15 @@ def summed(parts: list[Part], steps: int) -> Found:
     )
 
 
-def sentence(motions: Motions, found: Found) -> str:
-    """What was seen, in plain words."""
-    nearest = f"closest {found.share_of_limit:.6f} of it" if found.share_of_limit else "there is none"
+def sentence(motions: Motions, summary: Summary) -> str:
+    """The summary in plain words."""
+    nearest = f"closest {summary.share_of_limit:.6f} of it" if summary.share_of_limit else "there is none"
     return (
-        f"{found.rollouts} simulated motions of the {motions.plant} from instants all over [{motions.start:.6g} s, "
-        f"{motions.end:.6g} s], half of them from the funnel's boundary: {found.left_funnel} left the funnel (largest "
-        f"|y| after the start {found.level:.9f}), {found.left_limits} exceeded a limit on the states "
-        f"({nearest}), {found.moved_away} moved away from the goal in the goal region, "
-        f"{found.not_arrived} did not arrive. Integrator: {found.steps} classical Runge-Kutta steps an interval; "
-        f"halved steps change |y| of every {REPEATED}th motion by {found.error:.2g} at most; beyond 1 counts from "
-        f"{found.allowance:.2g} on."
+        f"{summary.rollouts} simulated motions of the {motions.plant} from instants all over [{motions.start:.6g} s, "
+        f"{motions.end:.6g} s], half of them from the funnel's boundary: {summary.left_funnel} left the funnel "
+        f"(largest |y| after the start {summary.level:.9f}), {summary.left_limits} exceeded a limit on the states "
+        f"({nearest}), {summary.moved_away} moved away from the goal in the goal region, "
+        f"{summary.not_arrived} did not arrive. Integrator: {summary.steps} classical Runge-Kutta steps an interval; "
+        f"halved steps change |y| of every {REPEATED}th motion by {summary.error:.2g} at most; beyond 1 counts from "
+        f"{summary.allowance:.2g} on."
     )

@@ -1,4 +1,4 @@
-"""The motions that a certificate speaks of, simulated: its claim and its ellipsoids alone, nothing of the prover.
+"""Simulated motions of a certificate's closed loop, from its claim and its ellipsoids alone.
 
 The equations are those of `rtcd_jax.analysis.verify`, written apart from the checker's and the plants'. Every motion is
 integrated by classical Runge-Kutta steps; every `REPEATED`-th one a second time with halved steps, and the largest
@@ -30,14 +30,14 @@ LONGEST = 60.0
 COARSER = 4
 """Steps in the goal region are so many times longer: there |y| falls fast, and its growth alone is judged."""
 TOGETHER = 0.2
-"""Time [s] between two looks for motions that have arrived."""
+"""Time [s] between two searches for motions that have arrived."""
 
 Input = Callable[[float, np.ndarray], np.ndarray]
 """Time [s], states [n M] -> u [M]."""
 
 
 class Ellipsoids(NamedTuple):
-    """One interval: its knot, its ends as shares of the knots' interval, and L at its ends with its bend."""
+    """One interval: its knot, its ends as fractions of the knots' interval, and L at its ends with its bend."""
 
     knot: int
     start: float
@@ -46,13 +46,13 @@ class Ellipsoids(NamedTuple):
     last: np.ndarray
     bend: np.ndarray
 
-    def axes(self, share: float) -> np.ndarray:
-        """L [n n] at a share of the knots' interval."""
-        s = (2 * share - self.start - self.end) / (self.end - self.start)
+    def axes(self, fraction: float) -> np.ndarray:
+        """L [n n] at a fraction of the knots' interval."""
+        s = (2 * fraction - self.start - self.end) / (self.end - self.start)
         return (self.first * (1 - s) + self.last * (1 + s)) / 2 + (1 - s * s) * (self.bend[0] + s * self.bend[1])
 
 
-class Seen(NamedTuple):
+class MotionResults(NamedTuple):
     """Of every motion, after its start: the largest |y| in the funnel, the largest share of a limit, the largest
     growth of |y| in one step in the goal region, whether it arrived; of all, the integrator's error in |y|."""
 
@@ -70,11 +70,11 @@ class Motions:
     def __init__(self, content: Any):
         claim = check.read_claim(Node("claim", content["claim"]))
         low, high = STEPS
-        check.insist(
+        check.require(
             low <= float(claim.dt) <= high, "claim.dt", f"cannot be simulated: must be from {low:g} s to {high:g} s"
         )
-        pieces = [check.read_stretch(Node(f"funnel[{i}]", each), claim) for i, each in enumerate(content["funnel"])]
-        check.insist(len(pieces) > 0, "funnel", "has no intervals")
+        intervals = [check.read_interval(Node(f"funnel[{i}]", each), claim) for i, each in enumerate(content["funnel"])]
+        check.require(len(intervals) > 0, "funnel", "has no intervals")
         name = content["claim"]["plant"]
         self.plant, self.n, self.dt, self.limit = name, claim.n, float(claim.dt), float(claim.limit)
         self._rate = CLOSED_FORMS[name]({key: float(value) for key, value in claim.parameters.items()})
@@ -82,10 +82,11 @@ class Motions:
         self._goal, self._goal_gain = _floats(claim.x_goal), _floats(claim.K_goal)
         self._bounds = np.array([np.inf if b is None else float(b) for b in claim.bounds])
         self._outward = np.linalg.inv(_floats(Node("goal.axes", content["goal"]["axes"]).array(self.n, self.n)))
-        self.pieces = [
-            Ellipsoids(p.knot, float(p.start), float(p.end), *map(_floats, (p.first, p.last, p.bend))) for p in pieces
+        self.intervals = [
+            Ellipsoids(p.knot, float(p.start), float(p.end), *map(_floats, (p.first, p.last, p.bend)))
+            for p in intervals
         ]
-        self.start = (self.pieces[0].knot + self.pieces[0].start) * self.dt
+        self.start = (self.intervals[0].knot + self.intervals[0].start) * self.dt
         self.end = len(self._u) * self.dt
 
     @classmethod
@@ -102,40 +103,42 @@ class Motions:
         except (Refused, Undecided, KeyError, TypeError, RecursionError, OverflowError, LinAlgError) as error:
             raise UserError(f"{path} is no certificate ({error}): `rtcd check` says more") from None
 
-    def follow(self, count: int, steps: int, random: np.random.Generator) -> Seen:
+    def follow(self, count: int, steps: int, random: np.random.Generator) -> MotionResults:
         """`count` motions to the goal, by `steps` steps an interval.
 
         They start in every interval in proportion to its length, at an instant of it drawn at random, every other one
         on the boundary, the others uniform inside.
         """
-        lengths = np.cumsum([p.end - p.start for p in self.pieces])
+        lengths = np.cumsum([p.end - p.start for p in self.intervals])
         places = np.searchsorted(lengths / lengths[-1], (np.arange(count) + 0.5) / count)
         y, x = _ball(self.n, count, random), np.empty((self.n, count))
         flight = _Flight(self._bounds, x, x[:, ::REPEATED].copy())
-        for place, piece in enumerate(self.pieces):
+        for place, interval in enumerate(self.intervals):
             before, after = np.searchsorted(places, (place, place + 1))
-            share = random.uniform(piece.start, piece.end)
-            x[:, before:after] = self._nominal(piece.knot, share)[:, None] + piece.axes(share) @ y[:, before:after]
+            fraction = random.uniform(interval.start, interval.end)
+            x[:, before:after] = (
+                self._nominal(interval.knot, fraction)[:, None] + interval.axes(fraction) @ y[:, before:after]
+            )
             flight.again[:] = np.where(np.arange(0, count, REPEATED) >= before, x[:, ::REPEATED], flight.again)
-            self._through(piece, piece.start, flight, slice(0, before), steps)
-            self._through(piece, share, flight, slice(before, after), steps)
+            self._through(interval, interval.start, flight, slice(0, before), steps)
+            self._through(interval, fraction, flight, slice(before, after), steps)
         arrived, growth = self._settle(flight, steps)
-        return Seen(flight.level, flight.share_of_limit, growth, arrived, flight.error)
+        return MotionResults(flight.level, flight.share_of_limit, growth, arrived, flight.error)
 
-    def _through(self, piece: Ellipsoids, start: float, flight: "_Flight", who: slice, steps: int) -> None:
-        """Carries some motions from a share of the interval to its end."""
+    def _through(self, interval: Ellipsoids, start: float, flight: "_Flight", who: slice, steps: int) -> None:
+        """Carries some motions from a fraction of the interval to its end."""
         if who.start == who.stop:
             return
         again = slice(-(-who.start // REPEATED), -(-who.stop // REPEATED))
-        shares = np.linspace(start, piece.end, steps + 1)
-        step = (shares[1] - shares[0]) * self.dt
-        law = self._tracking(piece.knot)
-        for share, ahead in itertools.pairwise(shares):
-            t = share * self.dt
+        fractions = np.linspace(start, interval.end, steps + 1)
+        step = (fractions[1] - fractions[0]) * self.dt
+        law = self._tracking(interval.knot)
+        for fraction, ahead in itertools.pairwise(fractions):
+            t = fraction * self.dt
             flight.x[:, who] = self._steps(law, t, step, flight.x[:, who], 1)
             flight.again[:, again] = self._steps(law, t, step, flight.again[:, again], 2)
-            inward = np.linalg.inv(piece.axes(ahead))
-            flight.look(self._nominal(piece.knot, ahead), inward, who, again)
+            inward = np.linalg.inv(interval.axes(ahead))
+            flight.measure(self._nominal(interval.knot, ahead), inward, who, again)
 
     def _settle(self, flight: "_Flight", steps: int) -> tuple[np.ndarray, np.ndarray]:
         """Whether every motion arrives, and the largest growth of |y| in one step."""
@@ -149,7 +152,7 @@ class Motions:
                 now = self._goal_level(x)
                 growth[moving] = np.maximum(growth[moving], now - level)
                 level = now
-                flight.mind_limits(x, moving)
+                flight.measure_limits(x, moving)
             flight.x[:, moving] = x
             arrived[moving[level <= ARRIVED]] = True
             moving = moving[level > ARRIVED]
@@ -161,15 +164,15 @@ class Motions:
         return np.linalg.norm(self._outward @ (x - self._goal[:, None]), axis=0)
 
     def _nominal(self, k: int, t: float) -> np.ndarray:
-        """x* at a share of an interval: the cubic Hermite interpolant."""
+        """x* at a fraction of an interval: the cubic Hermite interpolant."""
         a, b, va, vb = self._x[k], self._x[k + 1], self._rates[k][0] * self.dt, self._rates[k][1] * self.dt
         return a + t * (va + t * (3 * (b - a) - 2 * va - vb + t * (2 * (a - b) + va + vb)))
 
     def _tracking(self, k: int) -> Input:
         def u(t: float, x: np.ndarray) -> np.ndarray:
-            share = t / self.dt
-            gain = self._gains[k] + share * (self._gains[k + 1] - self._gains[k])
-            return self._u[k] - gain @ (x - self._nominal(k, share)[:, None])
+            fraction = t / self.dt
+            gain = self._gains[k] + fraction * (self._gains[k + 1] - self._gains[k])
+            return self._u[k] - gain @ (x - self._nominal(k, fraction)[:, None])
 
         return u
 
@@ -194,7 +197,7 @@ class Motions:
 
 
 class _Flight:
-    """Motions under way: their states [n M], every `REPEATED`-th by halved steps, and what was seen of them."""
+    """Motions under way: their states [n M], every `REPEATED`-th by halved steps, and their results so far."""
 
     def __init__(self, bounds: np.ndarray, x: np.ndarray, again: np.ndarray):
         self.x, self.again, self.error = x, again, 0.0
@@ -202,19 +205,19 @@ class _Flight:
         self._limited = np.isfinite(bounds)
         self._bounds = bounds[self._limited, None]
 
-    def look(self, center: np.ndarray, inward: np.ndarray, who: slice, again: slice) -> None:
+    def measure(self, center: np.ndarray, inward: np.ndarray, who: slice, again: slice) -> None:
         """|y| at an instant of the funnel; `inward` is L^-1."""
         level = np.linalg.norm(inward @ (self.x[:, who] - center[:, None]), axis=0)
         finer = np.linalg.norm(inward @ (self.again[:, again] - center[:, None]), axis=0)
         self.level[who] = np.maximum(self.level[who], level)
-        self.mind_limits(self.x[:, who], who)
+        self.measure_limits(self.x[:, who], who)
         if finer.size:
             self.error = max(self.error, float(np.max(np.abs(level[-who.start % REPEATED :: REPEATED] - finer))))
 
-    def mind_limits(self, x: np.ndarray, who: Any) -> None:
+    def measure_limits(self, x: np.ndarray, who: Any) -> None:
         if self._limited.any():
-            share = np.max(np.abs(x[self._limited]) / self._bounds, axis=0)
-            self.share_of_limit[who] = np.maximum(self.share_of_limit[who], share)
+            fraction = np.max(np.abs(x[self._limited]) / self._bounds, axis=0)
+            self.share_of_limit[who] = np.maximum(self.share_of_limit[who], fraction)
 
 
 def _ball(n: int, count: int, random: np.random.Generator) -> np.ndarray:

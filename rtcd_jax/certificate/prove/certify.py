@@ -1,4 +1,4 @@
-"""One elite's certificate: goal region, then funnel, every step kept on disk, so that a killed search goes on."""
+"""One elite's certificate: goal region, then funnel. A journal keeps every step, so that a killed proof goes on."""
 
 import hashlib
 import json
@@ -10,13 +10,13 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from rtcd_jax.certificate import check
-from rtcd_jax.certificate.check import Claim, Node, Refused, Witness
+from rtcd_jax.certificate.check import Claim, GramCertificate, Node, Refused
 from rtcd_jax.certificate.enlarge import all_knots as joint
 from rtcd_jax.certificate.enlarge import knot_by_knot as backward
-from rtcd_jax.certificate.prove.backward import SPARE, Descent, Front
-from rtcd_jax.certificate.prove.closed_loop import Loop, claim_of, double, doubles, sealed
+from rtcd_jax.certificate.prove.backward import DECAY_MARGINS, BackwardProof, ProofState
+from rtcd_jax.certificate.prove.closed_loop import Loop, claim_of, double, doubles, with_digests
 from rtcd_jax.certificate.prove.goal import GoalRegion, goal_region
-from rtcd_jax.certificate.prove.levels import directions, leveled
+from rtcd_jax.certificate.prove.levels import leveled, unit_directions
 from rtcd_jax.certificate.standing import accepted, remember
 from rtcd_jax.elite.elite import Elite
 from rtcd_jax.system.files import replace
@@ -24,7 +24,7 @@ from rtcd_jax.system.journal import Journal
 
 RUNGS = ("certified", "proved")
 COARSER = 2
-"""One of so many directions is enough for funnels that are not proved yet."""
+"""Stride of the directions for funnels that are not proved yet."""
 
 
 class Step(NamedTuple):
@@ -41,7 +41,7 @@ class Step(NamedTuple):
 class Outcome(NamedTuple):
     """A finished certificate beside what was sampled; volumes over the knots from `start` [s] on.
 
-    `beside` is the rung of the `sampled` volumes: another one where the elite comes from outside.
+    `volumes` are the certificate's. `beside` is the rung of the `sampled` ones: another for an external elite.
     """
 
     elite: str
@@ -50,7 +50,7 @@ class Outcome(NamedTuple):
     intervals: int
     seconds: float
     sampled: dict[str, float]
-    found: dict[str, float]
+    volumes: dict[str, float]
     beside: str = "sampled"
 
     @property
@@ -71,11 +71,13 @@ def certify_elite(
     """
     began = time.perf_counter()
     elite = Elite.read(run, name)
-    told, folder = claim_of(elite), run / "certificates"
-    claim = _claim(told, len(elite.u), 1.0)
+    loop_record, folder = claim_of(elite), run / "certificates"
+    at_goal = with_digests({**loop_record, "start": [len(elite.u) - 1, double(1.0)]})
+    claim = check.read_claim(Node("claim", at_goal))
     loop, exact = Loop(claim, elite), rung == "proved"
     journal = Journal(
-        folder / f".{name}.partial.jsonl", {"claim": check.seal(told), "rung": rung, "optimize_value": optimize_value}
+        folder / f".{name}.partial.jsonl",
+        {"claim": check.digest(loop_record), "rung": rung, "optimize_value": optimize_value},
     )
     if optimize_value:
         loop = _shaped(loop, journal)
@@ -83,34 +85,39 @@ def certify_elite(
     if region is None:
         return None
     goal, outlet = region
-    descent = Descent(claim, loop, exact)
-    front = _front(descent, claim, outlet, journal)
-    for proved in descent.down_from(front):
-        piece = proved.piece
+    proof = BackwardProof(claim, loop, exact)
+    state = _resumed(proof, claim, outlet, journal)
+    for proved in proof.intervals_from(state):
+        interval = proved.interval
         journal.append(
-            {"stretch": _stretch_record(piece), "rho": proved.rho, "spare": proved.spare, "margin": proved.margin}
+            {
+                "stretch": _interval_record(interval),
+                "rho": proved.rho,
+                "spare": proved.decay_margin,
+                "margin": proved.margin,
+            }
         )
-        at = (piece.knot + float(piece.start)) * loop.dt
-        on_step(Step(name, piece.knot, len(loop.u), at, proved.rho, proved.margin))
+        at = (interval.knot + float(interval.start)) * loop.dt
+        on_step(Step(name, interval.knot, len(loop.u), at, proved.rho, proved.margin))
     seconds = time.perf_counter() - began
-    stretches = [line["stretch"] for line in journal.lines if "stretch" in line][::-1]
-    if not stretches:
+    intervals = [line["stretch"] for line in journal.lines if "stretch" in line][::-1]
+    if not intervals:
         return None
-    start = [stretches[0]["knot"], stretches[0]["start"]]
+    start = [intervals[0]["knot"], intervals[0]["start"]]
     content = {
         "format": check.FORMAT,
         "version": check.VERSION,
-        "claim": sealed({**told, "start": start}),
-        "funnel": stretches,
+        "claim": with_digests({**loop_record, "start": start}),
+        "funnel": intervals,
         "goal": goal,
         "notes": {"elite": name, "rung at writing": rung},
     }
-    outcome = _finish(folder / f"{name}.json", sealed(content), elite, rung, seconds, journal)
+    outcome = _finish(folder / f"{name}.json", with_digests(content), elite, rung, seconds, journal)
     return outcome._replace(beside=elite.guarantee)
 
 
 def _finish(path: Path, content: dict[str, Any], elite: Elite, rung: str, seconds: float, journal: Journal) -> Outcome:
-    """The written certificate; on the rung *proved* it was accepted as a whole before."""
+    """Writes the certificate. On the rung *proved* the checker has accepted the whole file before."""
     file = (json.dumps(content, separators=(",", ":")) + "\n").encode()
     if rung == "proved":
         digest = hashlib.sha256(file).hexdigest()
@@ -118,10 +125,10 @@ def _finish(path: Path, content: dict[str, Any], elite: Elite, rung: str, second
     replace(path, file)
     journal.close()
     claim = check.read_claim(Node("claim", content["claim"]))
-    pieces = [check.read_stretch(Node("funnel", each), claim) for each in content["funnel"]]
+    intervals = [check.read_interval(Node("funnel", each), claim) for each in content["funnel"]]
     axes = Node("goal.axes", content["goal"]["axes"]).array(claim.n, claim.n)
-    found, _ = check.volumes_of(claim, pieces, axes)
-    start = float(pieces[0].knot + pieces[0].start)
+    volumes, _ = check.volumes_of(claim, intervals, axes)
+    start = float(intervals[0].knot + intervals[0].start)
     per_knot, step = elite.volumes_per_knot[int(np.ceil(start)) :], float(elite.time[1])
     sampled = {
         "inlet": float(per_knot[0]),
@@ -129,16 +136,11 @@ def _finish(path: Path, content: dict[str, Any], elite: Elite, rung: str, second
         "integral": float(np.trapezoid(per_knot, dx=step)),
         "goal": float(per_knot[-1]),
     }
-    return Outcome(path.stem, rung, start * step, len(pieces), seconds, sampled, found)
-
-
-def _claim(told: Mapping[str, Any], knot: int, share: float) -> Claim:
-    start = [knot - 1, double(share)]
-    return check.read_claim(Node("claim", sealed({**told, "start": start})))
+    return Outcome(path.stem, rung, start * step, len(intervals), seconds, sampled, volumes)
 
 
 def _region(claim: Claim, loop: Loop, exact: bool, journal: Journal) -> tuple[dict[str, Any], float] | None:
-    """The goal's record and the outlet's level, from the journal if they are there."""
+    """The goal's record and the outlet's level, from the journal if it has them."""
     for line in journal.lines:
         if "goal" in line:
             return line["goal"], line["outlet"]
@@ -151,7 +153,7 @@ def _region(claim: Claim, loop: Loop, exact: bool, journal: Journal) -> tuple[di
 
 
 def _shaped(loop: Loop, journal: Journal) -> Loop:
-    """The loop with the value function that is optimized with the funnel, from the journal if it is there."""
+    """The loop with the value function that is optimized with the funnel, from the journal if it has one."""
     for line in journal.lines:
         if "values" in line:
             return loop.shaped(np.array(line["values"]), np.array(line["slopes"]))
@@ -162,38 +164,38 @@ def _shaped(loop: Loop, journal: Journal) -> Loop:
 
 def largest(loop: Loop) -> Loop:
     """The loop with a value function whose funnel is larger, its level about 1; the same loop if it has no funnel."""
-    aims = directions(loop.n)[:, ::COARSER]
+    directions = unit_directions(loop.n)[:, ::COARSER]
     try:
-        funnel = leveled(loop, aims)
+        funnel = leveled(loop, directions)
     except Refused:
         return loop
-    return joint.enlarged(funnel, aims) if loop.n == 2 else backward.grown(funnel, aims)
+    return joint.enlarged(funnel, directions) if loop.n == 2 else backward.grown(funnel, directions)
 
 
-def _front(descent: Descent, claim: Claim, outlet: float, journal: Journal) -> Front:
-    """Where the journal ends."""
-    front = descent.outlet(outlet)
+def _resumed(proof: BackwardProof, claim: Claim, outlet: float, journal: Journal) -> ProofState:
+    """The state at which the journal ends."""
+    state = proof.outlet(outlet)
     for line in journal.lines:
         if "stretch" in line:
-            piece = check.read_stretch(Node("journal", line["stretch"]), claim)
-            rates = SPARE[claim.n]
-            place = rates.index(line["spare"]) if line["spare"] in rates else len(rates) - 1
-            trial = descent.next_trial(place, line["margin"])
-            front = Front(piece.knot, float(piece.start), line["rho"], piece.first, trial)
-    return front
+            interval = check.read_interval(Node("journal", line["stretch"]), claim)
+            rates = DECAY_MARGINS[claim.n]
+            trial = rates.index(line["spare"]) if line["spare"] in rates else len(rates) - 1
+            next_trial = proof.next_trial(trial, line["margin"])
+            state = ProofState(interval.knot, float(interval.start), line["rho"], interval.first, next_trial)
+    return state
 
 
-def _stretch_record(piece: check.Stretch) -> dict[str, Any]:
-    return sealed(
+def _interval_record(interval: check.Interval) -> dict[str, Any]:
+    return with_digests(
         {
-            "knot": piece.knot,
-            "start": double(piece.start),
-            "end": double(piece.end),
-            "first": _matrix(piece.first),
-            "last": _matrix(piece.last),
-            "bend": [_matrix(each) for each in piece.bend],
-            "orders": list(piece.orders),
-            "cases": _cases_record(piece.cases),
+            "knot": interval.knot,
+            "start": double(interval.start),
+            "end": double(interval.end),
+            "first": _matrix(interval.first),
+            "last": _matrix(interval.last),
+            "bend": [_matrix(each) for each in interval.bend],
+            "orders": list(interval.orders),
+            "cases": _cases_record(interval.cases),
         }
     )
 
@@ -203,20 +205,21 @@ def _goal_record(region: GoalRegion) -> dict[str, Any]:
     determinant = float(np.linalg.det(np.array([[float(c) for c in row] for row in region.axes])))
     weight = determinant**2 * (1 + region.outlet / region.rho) / 2
     shells = [
-        sealed({"start": double(s.start), "end": double(s.end), "cases": _cases_record(s.cases)}) for s in region.shells
+        with_digests({"start": double(s.start), "end": double(s.end), "cases": _cases_record(s.cases)})
+        for s in region.shells
     ]
     record = {"axes": _matrix(region.axes), "order": region.order, "weight": double(weight), "shells": shells}
-    return sealed(record)
+    return with_digests(record)
 
 
-def _cases_record(cases: Mapping[str, Witness]) -> dict[str, Any]:
+def _cases_record(cases: Mapping[str, GramCertificate]) -> dict[str, Any]:
     return {
         case: {
-            "degree": witness.degree,
-            "gram": [_triangle(matrix) for matrix in witness.gram],
-            "multipliers": [[_triangle(matrix) for matrix in each] for each in witness.multipliers],
+            "degree": certificate.degree,
+            "gram": [_triangle(matrix) for matrix in certificate.gram],
+            "multipliers": [[_triangle(matrix) for matrix in each] for each in certificate.multipliers],
         }
-        for case, witness in cases.items()
+        for case, certificate in cases.items()
     }
 
 

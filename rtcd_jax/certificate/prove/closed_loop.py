@@ -1,4 +1,4 @@
-"""An elite as a certificate sees it: the claim of its closed loop, and the same loop in float64 to search with."""
+"""The claim of an elite's closed loop, and the same loop in float64 for the search."""
 
 from collections.abc import Callable, Mapping
 from copy import copy
@@ -12,9 +12,9 @@ from rtcd_jax.elite.funnel import value_rates
 from rtcd_jax.numerics.hermite import cubic_hermite, cubic_hermite_rate
 from rtcd_jax.system.errors import UserError
 
-CLIMBERS, TRIES = 8, 40
-CLIMBS = (0.2, 0.1, 0.05, 0.02)
-"""Best directions of a sphere that are improved by so many random steps of these lengths."""
+ADVERSARIAL_DIRECTIONS, TRIES = 8, 40
+SEARCH_RADII = (0.2, 0.1, 0.05, 0.02)
+"""The most adversarial directions of a sphere are improved by so many random steps within these radii."""
 
 
 def double(value: float) -> str:
@@ -27,13 +27,13 @@ def doubles(values: Any) -> Any:
     return [doubles(v) for v in values] if np.ndim(values) else double(values)
 
 
-def sealed(record: Mapping[str, Any]) -> dict[str, Any]:
+def with_digests(record: Mapping[str, Any]) -> dict[str, Any]:
     """The record and the digests of its values."""
-    return {**record, "sha256": {name: check.seal(value) for name, value in record.items()}}
+    return {**record, "sha256": {name: check.digest(value) for name, value in record.items()}}
 
 
 def claim_of(elite: Elite) -> dict[str, Any]:
-    """The claim about an elite, without `start`: what is to be proved is written down before the proof.
+    """The claim about an elite, without `start`: what is to be proved is fixed before the proof.
 
     The rates of the cubic Hermite interpolant are f(x_k, u_k) and f(x_{k+1}, u_k), rounded to doubles.
 
@@ -59,7 +59,7 @@ def claim_of(elite: Elite) -> dict[str, Any]:
     ends = np.stack([x[:-1], x[1:]])
     with np.errstate(all="ignore"):  # the checker's reader refuses what is not finite
         rates = np.moveaxis(rate(plant, parameters, np.moveaxis(ends, 2, 0), u[:, 0]), 0, 2)
-    told = {
+    claim = {
         "plant": name,
         "parameters": {key: double(value) for key, value in parameters.items()},
         "state_limits": [double(limit) if np.isfinite(limit) else None for limit in elite.state_limits],
@@ -72,10 +72,10 @@ def claim_of(elite: Elite) -> dict[str, Any]:
         "K_goal": doubles(elite.K_goal[0]),
     }
     try:
-        check.read_claim(check.Node("the elite's claim", sealed({**told, "start": [0, double(0.0)]})))
+        check.read_claim(check.Node("the elite's claim", with_digests({**claim, "start": [0, double(0.0)]})))
     except check.Refused as refused:
         raise UserError(str(refused)) from None
-    return told
+    return claim
 
 
 def rate(plant: check.Plant, parameters: Mapping[str, float], x: np.ndarray, u: Any) -> np.ndarray:
@@ -103,9 +103,6 @@ class Loop:
     """
 
     def __init__(self, claim: check.Claim, elite: Elite):
-        def floats(values: Any) -> Any:
-            return np.array(_floats(values))
-
         self.claim = claim
         self.plant, self.n = claim.plant, claim.n
         self.parameters = {key: float(value) for key, value in claim.parameters.items()}
@@ -129,14 +126,14 @@ class Loop:
         other.values, other.slopes = values, slopes
         return other
 
-    def nominal(self, k: int, share: float) -> tuple[np.ndarray, np.ndarray]:
-        """x* and x*' at a share of the interval k."""
-        return hermite(share, self.dt, self.x[k], self.rates[k, 0], self.x[k + 1], self.rates[k, 1])
+    def nominal(self, k: int, fraction: float) -> tuple[np.ndarray, np.ndarray]:
+        """x* and x*' at a fraction of the interval k."""
+        return hermite(fraction, self.dt, self.x[k], self.rates[k, 0], self.x[k + 1], self.rates[k, 1])
 
-    def error_rate(self, k: int, share: float) -> Callable[[np.ndarray], np.ndarray]:
-        """Errors e [n D] from the nominal motion -> e' = f(x* + e, u) - x*' [n D], at a share of the interval k."""
-        center, center_rate = self.nominal(k, share)
-        gain = (1 - share) * self.gains[k] + share * self.gains[k + 1]
+    def error_rate(self, k: int, fraction: float) -> Callable[[np.ndarray], np.ndarray]:
+        """Errors e [n D] from the nominal motion -> e' = f(x* + e, u) - x*' [n D], at a fraction of the interval k."""
+        center, center_rate = self.nominal(k, fraction)
+        gain = (1 - fraction) * self.gains[k] + fraction * self.gains[k + 1]
 
         def rate(error: np.ndarray) -> np.ndarray:
             u = np.clip(self.u[k] - gain @ error, -self.limit, self.limit)
@@ -144,18 +141,18 @@ class Loop:
 
         return rate
 
-    def value(self, k: int, share: float) -> tuple[np.ndarray, np.ndarray]:
+    def value(self, k: int, fraction: float) -> tuple[np.ndarray, np.ndarray]:
         """S and S'."""
-        return hermite(share, self.dt, self.values[k], self.slopes[k, 0], self.values[k + 1], self.slopes[k, 1])
+        return hermite(fraction, self.dt, self.values[k], self.slopes[k, 0], self.values[k + 1], self.slopes[k, 1])
 
-    def axes(self, k: int, share: float, rho: float, growth: float) -> tuple[np.ndarray, np.ndarray]:
+    def axes(self, k: int, fraction: float, rho: float, growth: float) -> tuple[np.ndarray, np.ndarray]:
         """L with L L' = rho S^-1 and its rate, where rho' = growth rho; the angle's row has its first entry alone.
 
         Raises:
             Refused: between knots, S is not positive definite.
         """
-        s, slope = self.value(k, share)
-        check.insist(float(np.linalg.eigvalsh(s)[0]) > 0, f"interval {k}", "S is not positive definite between knots")
+        s, slope = self.value(k, fraction)
+        check.require(float(np.linalg.eigvalsh(s)[0]) > 0, f"interval {k}", "S is not positive definite between knots")
         p = np.linalg.inv(s) * rho
         p_rate = growth * p - p @ slope @ p / rho
         order = [self.plant.angle, *(i for i in range(self.n) if i != self.plant.angle)]
@@ -166,11 +163,11 @@ class Loop:
         sign[-1] = np.linalg.det(np.eye(self.n)[order])  # of the permutation: det L > 0
         return c[back] * sign, c_rate[back] * sign
 
-    def growth(self, k: int, share: float, rho: float, directions: np.ndarray) -> float:
-        """The largest V' / V over the surface V = rho, looked for from the sampled directions [n D]."""
-        s, slope = self.value(k, share)
-        axes, _ = self.axes(k, share, rho, 0.0)
-        error_rate = self.error_rate(k, share)
+    def growth(self, k: int, fraction: float, rho: float, directions: np.ndarray) -> float:
+        """The largest V' / V over the surface V = rho, searched from the sampled directions [n D]."""
+        s, slope = self.value(k, fraction)
+        axes, _ = self.axes(k, fraction, rho, 0.0)
+        error_rate = self.error_rate(k, fraction)
 
         def rises(y: np.ndarray) -> np.ndarray:
             error = axes @ y
@@ -178,24 +175,24 @@ class Loop:
 
         return _highest(rises, directions)
 
-    def drift(self, k: int, share: float, axes: np.ndarray, y: np.ndarray) -> np.ndarray:
+    def drift(self, k: int, fraction: float, axes: np.ndarray, y: np.ndarray) -> np.ndarray:
         """y'L^-1 (f(x* + L y, u) - x*') [D] for directions y [n D] of an ellipsoid L."""
-        return np.sum(y * np.linalg.solve(axes, self.error_rate(k, share)(axes @ y)), axis=0)
+        return np.sum(y * np.linalg.solve(axes, self.error_rate(k, fraction)(axes @ y)), axis=0)
 
-    def rooms(self, k: int, share: float) -> np.ndarray:
-        """The half widths [n] that the limits on the states leave to an ellipsoid."""
-        center, _ = self.nominal(k, share)
+    def clearance(self, k: int, fraction: float) -> np.ndarray:
+        """The half widths [n] that the limits on the states allow an ellipsoid."""
+        center, _ = self.nominal(k, fraction)
         return self.bounds - np.abs(center)
 
-    def box_level(self, k: int, share: float) -> float:
+    def box_level(self, k: int, fraction: float) -> float:
         """The level of the ellipsoid that touches a limit on the states."""
-        return _touching(self.rooms(k, share), self.value(k, share)[0])
+        return _touching(self.clearance(k, fraction), self.value(k, fraction)[0])
 
     def goal_box_level(self) -> float:
         """As `box_level`; half a turn away is another equilibrium, which no goal region has in it."""
-        rooms = self.bounds - np.abs(self.goal)
-        rooms[self.plant.angle] = min(rooms[self.plant.angle], np.pi)
-        return _touching(rooms, self.values[-1])
+        clearance = self.bounds - np.abs(self.goal)
+        clearance[self.plant.angle] = min(clearance[self.plant.angle], np.pi)
+        return _touching(clearance, self.values[-1])
 
     def goal_growth(self, rho: float, directions: np.ndarray) -> float:
         """As `growth`, about the goal."""
@@ -210,9 +207,9 @@ class Loop:
         return _highest(rises, directions)
 
 
-def _touching(rooms: np.ndarray, s: np.ndarray) -> float:
-    """The level of V = x'S x whose ellipsoid is as wide as the first of the rooms that it fills."""
-    return float(np.min(rooms**2 / np.diag(np.linalg.inv(s))))
+def _touching(clearance: np.ndarray, s: np.ndarray) -> float:
+    """The level of V = x'S x whose ellipsoid touches the first of the half widths [n]."""
+    return float(np.min(clearance**2 / np.diag(np.linalg.inv(s))))
 
 
 def _highest(f: Callable[[np.ndarray], np.ndarray], directions: np.ndarray) -> float:
@@ -220,9 +217,9 @@ def _highest(f: Callable[[np.ndarray], np.ndarray], directions: np.ndarray) -> f
     values = f(directions)
     if len(directions) == 2:  # a circle is covered densely
         return float(values.max())
-    random, best = np.random.default_rng(0), directions[:, np.argsort(values)[-CLIMBERS:]]
-    for reach in CLIMBS:
-        tries = best[:, :, None] + reach * random.normal(size=(*best.shape, TRIES))
+    random, best = np.random.default_rng(0), directions[:, np.argsort(values)[-ADVERSARIAL_DIRECTIONS:]]
+    for radius in SEARCH_RADII:
+        tries = best[:, :, None] + radius * random.normal(size=(*best.shape, TRIES))
         tries = np.concatenate([best[:, :, None], tries], axis=2)
         tries /= np.linalg.norm(tries, axis=0)
         values = f(tries.reshape(len(best), -1)).reshape(best.shape[1], -1)
@@ -230,11 +227,12 @@ def _highest(f: Callable[[np.ndarray], np.ndarray], directions: np.ndarray) -> f
     return float(values.max())
 
 
-def _floats(values: Any) -> Any:
-    return [_floats(v) for v in values] if isinstance(values, list | tuple) else float(values)
+def floats(values: Any) -> np.ndarray:
+    """Nested lists of exact numbers as doubles."""
+    return np.array(values, dtype=object).astype(float)
 
 
-def hermite(share: Any, dt: float, a: Any, a_rate: Any, b: Any, b_rate: Any) -> tuple[Any, Any]:
+def hermite(fraction: Any, dt: float, a: Any, a_rate: Any, b: Any, b_rate: Any) -> tuple[Any, Any]:
     """Value and rate of the cubic with these values and rates at the ends of an interval of `dt`."""
-    ends = share, dt, a, a_rate, b, b_rate
+    ends = fraction, dt, a, a_rate, b, b_rate
     return cubic_hermite(*ends), cubic_hermite_rate(*ends)

@@ -1,4 +1,4 @@
-"""The goal region: the largest provable level of V about the goal under its own saturated LQR, for all time."""
+"""The goal region: the largest level of V about the goal that can be proved under its saturated LQR, for all time."""
 
 from typing import NamedTuple
 
@@ -8,12 +8,12 @@ from rtcd_jax.certificate import check
 from rtcd_jax.certificate.check import Claim, Q, Refused, Shell
 from rtcd_jax.certificate.prove.backward import on_grid, prove
 from rtcd_jax.certificate.prove.closed_loop import Loop
-from rtcd_jax.certificate.prove.levels import directions, goal_level
+from rtcd_jax.certificate.prove.levels import goal_level, unit_directions
 
-LADDER = (1.0, 0.995, 0.985, 0.97, 0.95, 0.92, 0.88, 0.83, 0.77, 0.7, 0.6, 0.5, 0.35, 0.2, 0.1)
-"""Shares of the level that the samples allow, in the order of trial."""
-ROOM = 1e-3
-"""Share of the level by which the funnel's outlet is smaller than the goal region."""
+LEVEL_FRACTIONS = (1.0, 0.995, 0.985, 0.97, 0.95, 0.92, 0.88, 0.83, 0.77, 0.7, 0.6, 0.5, 0.35, 0.2, 0.1)
+"""Fractions of the level that the samples allow, in the order of trial."""
+OUTLET_CLEARANCE = 1e-3
+"""Fraction of the level by which the funnel's outlet is smaller than the goal region."""
 ORDERS = {2: 9, 4: 5}
 """By the number of states: order of Taylor models; the monomials have half the degree, rounded up."""
 NARROWEST = 1 / 64
@@ -32,20 +32,20 @@ class GoalRegion(NamedTuple):
 
 
 def goal_region(claim: Claim, loop: Loop, exact: bool) -> GoalRegion | None:
-    """The first level of the ladder that goes through; None if none does."""
-    aims = directions(claim.n)
+    """The region of the first level that can be proved; None if none can."""
+    directions = unit_directions(claim.n)
     try:
-        most = goal_level(loop, aims)
+        most = goal_level(loop, directions)
     except Refused:
         return None
-    for share in LADDER:
-        found = _at_level(claim, loop, share * most, exact, aims)
-        if found is not None:
-            return found
+    for fraction in LEVEL_FRACTIONS:
+        region = _at_level(claim, loop, fraction * most, exact, directions)
+        if region is not None:
+            return region
     return None
 
 
-def _at_level(claim: Claim, loop: Loop, rho: float, exact: bool, aims: np.ndarray) -> GoalRegion | None:
+def _at_level(claim: Claim, loop: Loop, rho: float, exact: bool, directions: np.ndarray) -> GoalRegion | None:
     last, order = len(loop.u) - 1, ORDERS[claim.n]
     axes = on_grid(loop.axes(last, 1.0, rho, 0.0)[0])
     degree, waiting, shells, least = (order + 2) // 2, [(0.0, 1.0)], [], np.inf
@@ -53,12 +53,12 @@ def _at_level(claim: Claim, loop: Loop, rho: float, exact: bool, aims: np.ndarra
         field = check.goal_field(claim, axes, order, "goal")
         while waiting:
             start, end = waiting.pop()
-            share = Q(*start.as_integer_ratio()), Q(*end.as_integer_ratio())
-            todo = check.goal_obligations(claim, field, *share)
-            found = prove(todo, degree, order + 1, exact, aims)
-            if found is not None:
-                shells.append(Shell(*share, found[0]))
-                least = min(least, found[1])
+            ends = Q(*start.as_integer_ratio()), Q(*end.as_integer_ratio())
+            todo = check.goal_obligations(claim, field, *ends)
+            proof = prove(todo, degree, order + 1, exact, directions)
+            if proof is not None:
+                shells.append(Shell(*ends, proof[0]))
+                least = min(least, proof[1])
             elif end - start <= NARROWEST:
                 return None
             else:
@@ -66,4 +66,4 @@ def _at_level(claim: Claim, loop: Loop, rho: float, exact: bool, aims: np.ndarra
                 waiting += [(middle, end), (start, middle)]
     except Refused:
         return None
-    return GoalRegion(rho, (1 - ROOM) * rho, axes, order, shells, least)
+    return GoalRegion(rho, (1 - OUTLET_CLEARANCE) * rho, axes, order, shells, least)

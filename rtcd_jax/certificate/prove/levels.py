@@ -1,28 +1,28 @@
-"""Levels of V as the loop allows them: at the goal, carried backward in time, and how large a funnel they make."""
+"""The levels of V that the loop allows: at the goal, and carried backward in time; and the size of their funnel."""
 
 from typing import NamedTuple
 
 import numpy as np
 
-from rtcd_jax.certificate.check import Refused, insist
+from rtcd_jax.certificate.check import Refused, require
 from rtcd_jax.certificate.prove.closed_loop import Loop, hermite
 
 LEVELS = 400
-"""Levels at which the fastest growth of V at the goal is looked at."""
+"""Levels at which the fastest growth of V at the goal is sampled."""
 HEUN_STEPS = 4
 COLLAPSE = 1e-3
-"""Share of its level that a funnel must keep within an interval."""
-BOX_SHARE = 0.999
-"""Share of the level at which an ellipsoid would touch a limit."""
-SHARE_OF_LIMIT = 0.99
-"""Share of what is left to a limit that ellipsoids of free shape may fill."""
-DIRECTIONS = {2: 720, 4: 4000}
-SPARED = 0.02
-"""Spare rate [1/s] of funnels that are not proved yet."""
-SHARES = np.linspace(0, 1, 5)
-"""Instants of an interval at which such a funnel is looked at."""
+"""Fraction of its level that a funnel must keep within an interval."""
+BOX_FRACTION = 0.999
+"""Fraction of the level at which an ellipsoid would touch a limit."""
+FRACTION_OF_LIMIT = 0.99
+"""Fraction of the clearance to a limit that ellipsoids of free shape may fill."""
+DIRECTION_COUNTS = {2: 720, 4: 4000}
+DECAY_MARGIN = 0.02
+"""Decay margin [1/s] of funnels that are not proved yet."""
+FRACTIONS = np.linspace(0, 1, 5)
+"""Fractions of an interval at which such a funnel is sampled."""
 INLET = 0.1
-"""The logarithm of the inlet's volume counts so much beside that of the integral."""
+"""Weight of the logarithm of the inlet's volume beside that of the integral."""
 
 
 class Carried(NamedTuple):
@@ -33,13 +33,13 @@ class Carried(NamedTuple):
     last: float
 
 
-def directions(n: int) -> np.ndarray:
+def unit_directions(n: int) -> np.ndarray:
     """Unit vectors [n D] that cover the sphere."""
     if n == 2:
-        angle = np.linspace(0, 2 * np.pi, DIRECTIONS[2], endpoint=False)
+        angle = np.linspace(0, 2 * np.pi, DIRECTION_COUNTS[2], endpoint=False)
         return np.stack([np.cos(angle), np.sin(angle)])
-    found = np.random.default_rng(0).normal(size=(n, DIRECTIONS[n]))
-    return found / np.linalg.norm(found, axis=0)
+    vectors = np.random.default_rng(0).normal(size=(n, DIRECTION_COUNTS[n]))
+    return vectors / np.linalg.norm(vectors, axis=0)
 
 
 def lower_pairs(n: int) -> list[tuple[int, int]]:
@@ -55,63 +55,65 @@ def products(p: np.ndarray, q: np.ndarray) -> np.ndarray:
     )
 
 
-def goal_level(loop: Loop, aims: np.ndarray) -> float:
+def goal_level(loop: Loop, directions: np.ndarray) -> float:
     """The largest level up to which V falls in the sampled directions [n D], under the limits on the states.
 
     Raises:
         Refused: V falls at no level.
     """
-    levels = BOX_SHARE * loop.goal_box_level() * np.linspace(0, 1, LEVELS + 1)
-    falls = [loop.goal_growth(level, aims) < 0 for level in levels[1:]]
+    levels = BOX_FRACTION * loop.goal_box_level() * np.linspace(0, 1, LEVELS + 1)
+    falls = [loop.goal_growth(level, directions) < 0 for level in levels[1:]]
     last = falls.index(False) if False in falls else LEVELS
-    insist(last > 0, "goal", "V does not fall")
+    require(last > 0, "goal", "V does not fall")
     return float(levels[last])
 
 
-def carried_back(loop: Loop, k: int, start: float, end: float, rho: float, spare: float, aims: np.ndarray) -> Carried:
+def carried_back(
+    loop: Loop, k: int, start: float, end: float, rho: float, decay_margin: float, directions: np.ndarray
+) -> Carried:
     """The level that the loop carries into rho at the end, by Heun's method on its logarithm, under the limits.
 
     Raises:
         Refused: the level vanishes.
     """
 
-    def growth(share: float, level: float) -> float:
-        return loop.growth(k, share, level, aims) + spare
+    def growth(fraction: float, level: float) -> float:
+        return loop.growth(k, fraction, level, directions) + decay_margin
 
     step, held = (end - start) / HEUN_STEPS, rho
     last = slope = growth(end, rho)
     for i in range(HEUN_STEPS):
-        share = end - (i + 1) * step
+        fraction = end - (i + 1) * step
         guess = rho * np.exp(-step * loop.dt * slope)
-        rho *= np.exp(-step * loop.dt * (slope + growth(share, guess)) / 2)
+        rho *= np.exp(-step * loop.dt * (slope + growth(fraction, guess)) / 2)
         if rho < COLLAPSE * held:
             raise Refused("interval", "the level vanishes")
-        slope = growth(share, rho)
-    cap = BOX_SHARE * loop.box_level(k, start)
+        slope = growth(fraction, rho)
+    cap = BOX_FRACTION * loop.box_level(k, start)
     if rho > cap:
         both = float(np.log(held / cap) / ((end - start) * loop.dt))
         return Carried(cap, both, both)
     return Carried(float(rho), slope, last)
 
 
-def leveled(loop: Loop, aims: np.ndarray) -> Loop:
+def leveled(loop: Loop, directions: np.ndarray) -> Loop:
     """The same shapes at the levels of a funnel, which become 1.
 
     Raises:
         Refused: the level vanishes, or V is not positive definite.
     """
-    rho, n = goal_level(loop, aims), len(loop.u)
+    rho, n = goal_level(loop, directions), len(loop.u)
     values, slopes = loop.values.copy(), loop.slopes.copy()
     values[n] /= rho
     for k in range(n - 1, -1, -1):
         slopes[k, 1] /= rho
-        carried = carried_back(loop, k, 0.0, 1.0, rho, SPARED, aims)
+        carried = carried_back(loop, k, 0.0, 1.0, rho, DECAY_MARGIN, directions)
         slopes[k, 1] -= carried.last * values[k + 1]
         rho = carried.rho
         values[k] /= rho
         slopes[k, 0] = slopes[k, 0] / rho - carried.first * values[k]
     other = loop.shaped(values, slopes)
-    insist(np.linalg.eigvalsh(values_at(other)[0]).min() > 0, "funnel", "S is not positive definite between knots")
+    require(np.linalg.eigvalsh(values_at(other)[0]).min() > 0, "funnel", "S is not positive definite between knots")
     return other
 
 
@@ -123,10 +125,10 @@ def merit(loop: Loop) -> float:
 def integral(loop: Loop) -> float:
     """Over time, of the volumes of {V <= 1}, up to the unit ball's."""
     value, _ = values_at(loop)
-    return float(np.trapezoid(np.linalg.det(value) ** -0.5, SHARES).sum() * loop.dt)
+    return float(np.trapezoid(np.linalg.det(value) ** -0.5, FRACTIONS).sum() * loop.dt)
 
 
 def values_at(loop: Loop) -> tuple[np.ndarray, np.ndarray]:
     """P and P' [N T n n] at the instants of all N intervals."""
     first, last = loop.slopes[:, None, 0], loop.slopes[:, None, 1]
-    return hermite(SHARES[:, None, None], loop.dt, loop.values[:-1, None], first, loop.values[1:, None], last)
+    return hermite(FRACTIONS[:, None, None], loop.dt, loop.values[:-1, None], first, loop.values[1:, None], last)

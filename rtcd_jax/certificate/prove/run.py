@@ -100,12 +100,16 @@ def _work(folder: Path, name: str, rung: str, optimize_value: bool) -> Outcome |
 
 def rank_correlation(outcomes: Sequence[Outcome]) -> float:
     """Spearman's, between the sampled and the shown sums of volumes: 1 if the proof would rank the elites the same."""
-    sums = [[outcome.sampled["sum"], outcome.found["sum"]] for outcome in outcomes]
+    sums = [[outcome.sampled["sum"], outcome.volumes["sum"]] for outcome in outcomes]
     return float(cast(Any, spearmanr(sums)).statistic)
 
 
 def _summary(outcome: Outcome | None) -> dict[str, Any] | None:
-    return None if outcome is None else outcome._asdict()
+    """An outcome as `summary.json` has it: the certificate's volumes under `found`."""
+    if outcome is None:
+        return None
+    names = {"volumes": "found"}
+    return {names.get(key, key): value for key, value in outcome._asdict().items()}
 
 
 def _sentence(step: Step) -> str:
@@ -121,7 +125,7 @@ def _table(outcomes: Sequence[Outcome], title: str) -> str:
 
 
 def _row(outcome: Outcome) -> list[str]:
-    pairs = {key: f"{value:.4g} / {outcome.found[key]:.4g}" for key, value in outcome.sampled.items()}
+    pairs = {key: f"{value:.4g} / {outcome.volumes[key]:.4g}" for key, value in outcome.sampled.items()}
     sampled = outcome.sampled["sum"]
     return [
         outcome.elite,
@@ -130,7 +134,7 @@ def _row(outcome: Outcome) -> list[str]:
         f"{outcome.seconds:.1f}",
         pairs["inlet"],
         pairs["sum"],
-        f"{outcome.found['sum'] / sampled:.4f}" if sampled else "none",
+        f"{outcome.volumes['sum'] / sampled:.4f}" if sampled else "none",
         pairs["integral"],
         pairs["goal"],
     ]

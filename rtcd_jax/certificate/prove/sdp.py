@@ -1,4 +1,4 @@
-"""The semidefinite program behind one obligation: the witness with the largest margin, in float64.
+"""The semidefinite program behind one obligation: the Gram certificate with the largest margin, in float64.
 
 maximize t  such that, for every Bernstein index j and modulo |y|^2 = 1,
 
@@ -22,10 +22,10 @@ import numpy as np
 import scipy.sparse as sp
 
 from rtcd_jax.certificate import check
-from rtcd_jax.certificate.check import Obligation, Q, Witness
+from rtcd_jax.certificate.check import GramCertificate, Obligation, Q
 
 GRID = 44
-"""Witnesses are rounded to multiples of 2^-44, so that the checker's integers stay short."""
+"""Gram certificates are rounded to multiples of 2^-44, so that the checker's integers stay short."""
 LIFT = 2.0**-36
 """Added to every diagonal: the solver's matrices are positive definite up to its tolerance only."""
 SAMPLED_TIMES = 7
@@ -51,11 +51,11 @@ class Data(NamedTuple):
 
 @final
 @dataclass(frozen=True)
-class Solved:
+class Solution:
     """Margin t and the matrices G_j, S_ia behind it; not proved before the checker accepts them."""
 
     margin: float
-    witness: Witness
+    certificate: GramCertificate
 
 
 @lru_cache(None)
@@ -64,14 +64,11 @@ def _index(n: int, degree: int) -> dict[tuple[int, ...], int]:
 
 
 @lru_cache(None)
-def _gram_map(n: int, degree: int) -> sp.csc_matrix:
-    """Coefficients of z'G z by monomials up to 2 degree, of G as a scaled upper triangle by columns."""
-    return _product_map(n, degree, 0, 2 * degree)[0]
-
-
-@lru_cache(None)
 def _product_map(n: int, degree: int, side: int, up_to: int) -> list[sp.csc_matrix]:
-    """For every monomial m up to `side`: coefficients of (z'G z) m by monomials up to `up_to`."""
+    """For every monomial m up to `side`: coefficients of (z'G z) m by monomials up to `up_to`.
+
+    They multiply G as a scaled upper triangle by columns.
+    """
     basis, index, maps = check.monomials(n, degree), _index(n, up_to), []
     for m in check.monomials(n, side):
         rows, columns, values = [], [], []
@@ -161,11 +158,11 @@ def _weights(degree: int, t: float) -> np.ndarray:
     return np.array([math.comb(degree, j) * t**j * (1 - t) ** (degree - j) for j in range(degree + 1)])
 
 
-def solve(data: Data, shape: Shape) -> Solved | None:
-    """The best witness by Clarabel; None where the solver has none, or no positive margin."""
+def solve(data: Data, shape: Shape) -> Solution | None:
+    """The best Gram certificate by Clarabel; None where the solver has none, or no positive margin."""
     import clarabel
 
-    gram, parts = _gram_map(shape.n, shape.degree), shape.bernstein + 1
+    gram, parts = _product_map(shape.n, shape.degree, 0, 2 * shape.degree)[0], shape.bernstein + 1
     rows, multipliers = gram.shape[0], _multiplier_blocks(shape, data.g)
     constant = np.zeros((rows, 1))
     constant[0] = 1
@@ -194,16 +191,16 @@ def solve(data: Data, shape: Shape) -> Solved | None:
     x = np.asarray(solution.x)
     if str(solution.status) not in ("Solved", "AlmostSolved") or not np.all(np.isfinite(x)) or x[0] <= 0:
         return None
-    return Solved(float(x[0]), _witness(shape, x[1:], sizes))
+    return Solution(float(x[0]), _gram_certificate(shape, x[1:], sizes))
 
 
-def _witness(shape: Shape, x: np.ndarray, sizes: list[int]) -> Witness:
+def _gram_certificate(shape: Shape, x: np.ndarray, sizes: list[int]) -> GramCertificate:
     """The solver's triangles as exact matrices on the grid, lifted to be positive definite."""
     ends = np.cumsum([rows * (rows + 1) // 2 for rows in sizes])
     matrices = [_exact(rows, part) for rows, part in zip(sizes, np.split(x, ends[:-1]), strict=True)]
     parts, each = shape.bernstein + 1, shape.multiplier + 1
     rest = matrices[parts:]
-    return Witness(shape.degree, matrices[:parts], [rest[i : i + each] for i in range(0, len(rest), each)])
+    return GramCertificate(shape.degree, matrices[:parts], [rest[i : i + each] for i in range(0, len(rest), each)])
 
 
 def _exact(rows: int, triangle: np.ndarray) -> list[list]:
