@@ -120,7 +120,7 @@ class MjxStepper(eqx.Module):
 class CpuDynamics:
     """State derivatives of many states of one model by C MuJoCo, in one thread.
 
-    It knows nothing of JAX: the independent witness of the closed form and of MJX.
+    It knows nothing of JAX: an independent simulator for the closed form and MJX.
     """
 
     def __init__(self, model: mujoco.MjModel, capacity: int):

@@ -243,8 +243,8 @@ def test_a_proved_elites_claim_stands_wherever_its_controller_does(proved):
 def cheat(content):
     """A matrix of the proof is another: the checker refuses it."""
     piece = content["funnel"][0]
-    witness = next(iter(piece["cases"].values()))
-    witness["gram"][0][0] = "-0x1.0p+3"
+    certificate = next(iter(piece["cases"].values()))
+    certificate["gram"][0][0] = "-0x1.0p+3"
     return resealed(content)
 
 

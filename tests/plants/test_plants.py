@@ -98,6 +98,8 @@ def test_an_unknown_plant_is_answered_with_the_known_ones():
 def test_the_verifications_own_closed_form_is_the_plants(robot):
     name = next(name for name, robot_class in PLANTS.items() if isinstance(robot.plant, robot_class))
     for index in range(3):
-        witness = CLOSED_FORMS[name](robot.plant.parameters(robot.design(index)))
+        numpy_form = CLOSED_FORMS[name](robot.plant.parameters(robot.design(index)))
         expected = jax.vmap(lambda x, u, i=index: robot.plant.dynamics(robot.design(i), x, u))(robot.x, robot.u)
-        np.testing.assert_allclose(witness(np.asarray(robot.x), np.asarray(robot.u)), expected, rtol=1e-11, atol=1e-11)
+        np.testing.assert_allclose(
+            numpy_form(np.asarray(robot.x), np.asarray(robot.u)), expected, rtol=1e-11, atol=1e-11
+        )

@@ -1,4 +1,4 @@
-"""A whole run, small in every number: its folder, its resumption after kills, its promise before the witnesses."""
+"""A whole run, small in every number: its folder, its resumption after kills, its promise before the simulators."""
 
 import json
 import random
@@ -114,7 +114,7 @@ def test_another_configuration_is_refused_by_its_key(finished, small):
 
 
 def test_the_run_keeps_its_promise(finished, small):
-    """Of the best and the initial candidate, before both witnesses."""
+    """Of the best and the initial candidate, before both independent simulators."""
     code, output, errors = small.call("verify", finished, "--states", "400")
     assert code == 0, output + errors
     for name in ("000", "initial"):

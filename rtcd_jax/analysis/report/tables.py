@@ -107,19 +107,19 @@ def ranks(run: Run) -> tuple[float, int] | None:
 
 
 def verification(runs: Sequence[Run]) -> Table | None:
-    """What the witnesses saw; None before `rtcd verify`."""
+    """The outcomes of the independent simulators; None before `rtcd verify`."""
     heads = (
-        *_run_head(runs), "funnel", "witness", "states", "left funnel", "left limits", "missed goal",
+        *_run_head(runs), "funnel", "simulator", "states", "left funnel", "left limits", "missed goal",
         "failure rate", "at least", "at most", "promised", "confidence", "promise",
     )  # fmt: skip
     rows = []
     for run in runs:
         for name, record in run.verification.items():
-            for witness, seen in record.get("witnesses", {}).items():
+            for simulator, seen in record.get("witnesses", {}).items():
                 counts = [seen.get(key) for key in ("left_funnel", "left_limits", "missed_goal")]
                 counts += [seen.get(key) for key in ("rate", "rate_lower", "rate_upper")]
                 promise = [record.get("epsilon"), record.get("confidence"), _refuted(not seen.get("kept"))]
-                rows.append((*_run_cell(runs, run), name, witness, record.get("states"), *counts, *promise))
+                rows.append((*_run_cell(runs, run), name, simulator, record.get("states"), *counts, *promise))
     return Table(heads, tuple(rows)) if rows else None
 
 

@@ -27,13 +27,13 @@ FUNNELS = "000", INITIAL
 
 @final
 class Job(NamedTuple):
-    """One chunk of one funnel's trial before one witness."""
+    """One chunk of a funnel's held-out states, for one simulator."""
 
     run: Path
     funnel: str
     states: int
     seed: int
-    witness: str
+    simulator: str
     chunk: int
 
 
@@ -57,15 +57,15 @@ def verify_run(folder: Path, states: int, seed: int, workers: int, console: Cons
         except NoFunnel as error:
             console.message(f"{funnel}: nothing to verify, it has no funnel ({error.status})")
     jobs = [
-        Job(folder, funnel, states, seed, witness, chunk)
+        Job(folder, funnel, states, seed, simulator, chunk)
         for funnel, trial in trials.items()
-        for witness in trial.names
+        for simulator in trial.names
         for chunk in range(trial.chunks)
     ]
     outcomes = _outcomes(jobs, parts, workers, console)
     verifications = {}
     for funnel, trial in trials.items():
-        found = {(job.witness, job.chunk): seen for job, seen in outcomes.items() if job.funnel == funnel}
+        found = {(job.simulator, job.chunk): seen for job, seen in outcomes.items() if job.funnel == funnel}
         verifications[funnel] = trial.verification(found)
         replace_json(folder / "verification" / f"{funnel}.json", verifications[funnel].record())
     with writing(parts):
@@ -108,7 +108,7 @@ def _done(jobs: Sequence[Job], workers: int) -> Iterator[tuple[Job, Outcome]]:
 
 
 def _do(job: Job) -> Outcome:
-    return _trial(job.run, job.funnel, job.states, job.seed).outcome(job.witness, job.chunk)
+    return _trial(job.run, job.funnel, job.states, job.seed).outcome(job.simulator, job.chunk)
 
 
 def _part(parts: Path, job: Job) -> Path:
@@ -135,25 +135,25 @@ def _kept(part: Path) -> Outcome | None:
 
 def _table(verifications: Mapping[str, Verification]) -> str:
     headings = (
-        "funnel", "witness", "states", "left funnel", "left limits", "missed goal", "rate", "in", "promised <=", "",
+        "funnel", "simulator", "states", "left funnel", "left limits", "missed goal", "rate", "in", "promised <=", "",
     )  # fmt: skip
-    rows = (_row(funnel, trial, witness) for funnel, trial in verifications.items() for witness in trial.outcomes)
+    rows = (_row(funnel, trial, simulator) for funnel, trial in verifications.items() for simulator in trial.outcomes)
     title = "random states of the funnels (promise: sampled); refuted where the interval lies above the promise"
-    return table(headings, rows, title, left={"funnel", "witness", ""})
+    return table(headings, rows, title, left={"funnel", "simulator", ""})
 
 
-def _row(funnel: str, verification: Verification, witness: str) -> list[str]:
-    outcome, states = verification.outcomes[witness], len(verification.knots)
-    lower, upper = verification.interval(witness)
+def _row(funnel: str, verification: Verification, simulator: str) -> list[str]:
+    outcome, states = verification.outcomes[simulator], len(verification.knots)
+    lower, upper = verification.interval(simulator)
     return [
         funnel,
-        witness,
+        simulator,
         f"{states}",
         f"{outcome.left_funnel.sum()}",
         f"{outcome.left_limits.sum()}",
         f"{outcome.missed_goal.sum()}",
-        f"{verification.failures(witness) / states:.2g}",
+        f"{verification.failures(simulator) / states:.2g}",
         f"[{lower:.2g}, {upper:.2g}]",
         f"{verification.epsilon:.2g} ({verification.confidence:g})",
-        "REFUTED" if verification.refutes(witness) else "not refuted",
+        "REFUTED" if verification.refutes(simulator) else "not refuted",
     ]

@@ -1,4 +1,4 @@
-"""What the witnesses saw of a funnel's fresh states, and what that says of its promise."""
+"""The outcomes of a funnel's held-out states in independent simulators, and whether they refute its promise."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
@@ -20,7 +20,7 @@ CHUNK = 1000
 @final
 @dataclass(frozen=True)
 class Verification:
-    """What each witness saw of the same states; `knots` says in which ellipsoid a state started."""
+    """Each simulator's outcomes of the same states; `knots` says in which ellipsoid a state started."""
 
     knots: Int[np.ndarray, " states"]
     states: Float[np.ndarray, "states n"]
@@ -29,16 +29,16 @@ class Verification:
     confidence: float
     seed: int
 
-    def failures(self, witness: str) -> int:
-        return int(self.outcomes[witness].failed.sum())
+    def failures(self, simulator: str) -> int:
+        return int(self.outcomes[simulator].failed.sum())
 
-    def interval(self, witness: str) -> tuple[float, float]:
+    def interval(self, simulator: str) -> tuple[float, float]:
         """Clopper-Pearson bounds of the failure probability, each with the promise's confidence."""
-        return clopper_pearson(self.failures(witness), len(self.knots), self.confidence)
+        return clopper_pearson(self.failures(simulator), len(self.knots), self.confidence)
 
-    def refutes(self, witness: str) -> bool:
+    def refutes(self, simulator: str) -> bool:
         """Whether the failures refute the promise: then even the lower bound exceeds epsilon."""
-        return self.interval(witness)[0] > self.epsilon
+        return self.interval(simulator)[0] > self.epsilon
 
     @property
     def refuted(self) -> bool:
@@ -46,7 +46,7 @@ class Verification:
 
     @property
     def disagreements(self) -> int:
-        """States on which the witnesses' verdicts differ."""
+        """States on which the simulators' verdicts differ."""
         failed = np.stack([outcome.failed for outcome in self.outcomes.values()])
         return int(np.sum(failed.any(axis=0) & ~failed.all(axis=0)))
 
@@ -59,21 +59,21 @@ class Verification:
             "confidence": self.confidence,
             "kept": not self.refuted,
             "disagreements": self.disagreements,
-            "witnesses": {witness: self._record_of(witness) for witness in self.outcomes},
+            "witnesses": {simulator: self._record_of(simulator) for simulator in self.outcomes},
         }
 
-    def _record_of(self, witness: str) -> dict[str, Any]:
-        outcome = self.outcomes[witness]
-        lower, upper = self.interval(witness)
+    def _record_of(self, simulator: str) -> dict[str, Any]:
+        outcome = self.outcomes[simulator]
+        lower, upper = self.interval(simulator)
         return {
             "left_funnel": outcome.left_funnel.sum(),
             "left_limits": outcome.left_limits.sum(),
             "missed_goal": outcome.missed_goal.sum(),
-            "failures": self.failures(witness),
-            "rate": self.failures(witness) / len(self.knots),
+            "failures": self.failures(simulator),
+            "rate": self.failures(simulator) / len(self.knots),
             "rate_lower": lower,
             "rate_upper": upper,
-            "kept": not self.refutes(witness),
+            "kept": not self.refutes(simulator),
             "failures_per_knot": np.bincount(self.knots[outcome.failed], minlength=self.knots[-1] + 1),
         }
 
@@ -112,7 +112,7 @@ class Trial:
         return self.elite.sample(self.states, np.random.default_rng(self.seed))
 
     def outcome(self, name: str, chunk: int) -> Outcome:
-        """What one witness sees of one chunk.
+        """One simulator's outcome of one chunk.
 
         Raises:
             UserError: a goal that its own LQR does not hold.
@@ -122,7 +122,7 @@ class Trial:
         return simulate(self.elite, simulator.dynamics, simulator.march, knots, x, simulator.settle)
 
     def verification(self, outcomes: Mapping[tuple[str, int], Outcome]) -> Verification:
-        """All chunks' outcomes, by witness and chunk, put together."""
+        """All chunks' outcomes, by simulator and chunk, put together."""
         merged = {name: self._merged(name, outcomes) for name in dict.fromkeys(name for name, _ in outcomes)}
         return Verification(*self.sample(), merged, self.elite.epsilon, self.elite.confidence, self.seed)
 
@@ -135,7 +135,7 @@ class Trial:
 
 
 def verify_funnel(elite: Elite, states: int = 1000, seed: int = 0) -> Verification:
-    """Puts `states` fresh states of the funnel before every witness that knows the plant, in this process.
+    """Simulates `states` held-out states of the funnel by every simulator that knows the plant, in this process.
 
     Raises:
         UserError: fewer states than knots, or a goal that its own LQR does not hold.

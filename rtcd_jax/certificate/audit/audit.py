@@ -78,7 +78,10 @@ def audit_funnel(external: ExternalFunnel, cost: Cost, states: int, seed: int, o
     """
     given, misfits = with_fitting_inputs(external)
     config = config_of(given, cost)
-    _claim(out)
+    foreign = sorted(item.name for item in out.iterdir()) if out.is_dir() and not (out / RECORD).is_file() else []
+    if foreign:
+        raise UserError(f"--out = {out}: must be a new or empty folder, or a former audit's: it has {foreign[0]}")
+    make_folder(out)
     try:
         result = escapes(Elite.of(*elite_of(given, cost)), states, seed)
         off = np.max(np.abs(defects(given)), axis=0)
@@ -95,14 +98,6 @@ def audit_funnel(external: ExternalFunnel, cost: Cost, states: int, seed: int, o
         f"{out} --elites 2`"
     )
     return not np.any(result.share > 0)
-
-
-def _claim(out: Path) -> None:
-    """Makes the folder, unless it holds what is no audit's."""
-    foreign = sorted(item.name for item in out.iterdir()) if out.is_dir() and not (out / RECORD).is_file() else []
-    if foreign:
-        raise UserError(f"--out = {out}: must be a new or empty folder, or a former audit's: it has {foreign[0]}")
-    make_folder(out)
 
 
 def _record(

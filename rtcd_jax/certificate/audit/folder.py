@@ -30,7 +30,9 @@ def config_of(external: ExternalFunnel, cost: Cost) -> Config:
                 "goal": external.goal.tolist(),
                 "state_limits": cost.limits.tolist(),
             },
-            "design": {name: _pinned(value) for name, value in design.items()},
+            "design": {
+                name: {"initial": value, "min": value, "max": value, "pinned": True} for name, value in design.items()
+            },
             "weights": {"q": [_searched(value) for value in cost.q.tolist()], "r": [_searched(cost.r)]},
             "trajectory": {"knots": len(external.x), "step": {"min": external.dt, "max": external.dt}},
         },
@@ -65,10 +67,6 @@ def units(config: Config) -> dict[str, Any]:
     plant = config.plant
     volume = " ".join(plant.states.values())
     return {"states": plant.states, "inputs": plant.inputs, "design": plant.design, "time": "s", "volume": volume}
-
-
-def _pinned(value: float) -> dict[str, Any]:
-    return {"initial": value, "min": value, "max": value, "pinned": True}
 
 
 def _searched(value: float) -> dict[str, Any]:

@@ -93,15 +93,11 @@ def projected(external: ExternalFunnel, cost: Cost) -> ExternalFunnel:
         if np.max(np.abs(x[1:] - now.end)) < EXACT and np.max(np.abs(u)) <= external.limit:
             moved = external._replace(x=x, u=u)
             values = tracking_values(moved, cost)
-            return moved._replace(S=values, rho=_levels(external, values))
+            ratios = np.linalg.det(values) / np.linalg.det(external.S)
+            levels = external.rho * ratios ** (1 / len(external.goal))  # of the given volumes
+            return moved._replace(S=values, rho=levels)
         x, u = _nearest(external, x, u, now, cost.limits)
     raise UserError("no motion near the given one solves the dynamics between its ends and within the limits")
-
-
-def _levels(external: ExternalFunnel, values: np.ndarray) -> np.ndarray:
-    """With which the ellipsoids of other shapes have the given volumes."""
-    n = len(external.goal)
-    return external.rho * (np.linalg.det(values) / np.linalg.det(external.S)) ** (1 / n)
 
 
 def _nearest(

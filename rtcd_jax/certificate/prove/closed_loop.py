@@ -14,7 +14,7 @@ from rtcd_jax.system.errors import UserError
 
 ADVERSARIAL_DIRECTIONS, TRIES = 8, 40
 SEARCH_RADII = (0.2, 0.1, 0.05, 0.02)
-"""The most adversarial directions of a sphere are improved by so many random steps within these radii."""
+"""The most adversarial directions of a sphere are improved by random steps: `TRIES` for each standard deviation."""
 
 
 def double(value: float) -> str:

@@ -48,7 +48,10 @@ def certify_run(
         if isinstance(event, Step):
             reached[event.elite] = 1 - event.knot / event.knots
             done = sum(reached.values())
-            text = f"{_sentence(event)}  {clock.times(done, len(names))}"
+            text = (
+                f"elite {event.elite}  interval {event.knot + 1}/{event.knots}  back to t = {event.time:.3f} s"
+                f"  rho {event.rho:.4g}  margin {event.margin:.2g}/s  {clock.times(done, len(names))}"
+            )
             console.progress(Progress(done, len(names), text))
         else:
             outcomes[event[0]] = event[1]
@@ -112,29 +115,23 @@ def _summary(outcome: Outcome | None) -> dict[str, Any] | None:
     return {names.get(key, key): value for key, value in outcome._asdict().items()}
 
 
-def _sentence(step: Step) -> str:
-    return (
-        f"elite {step.elite}  interval {step.knot + 1}/{step.knots}  back to t = {step.time:.3f} s"
-        f"  rho {step.rho:.4g}  margin {step.margin:.2g}/s"
-    )
-
-
 def _table(outcomes: Sequence[Outcome], title: str) -> str:
     headings = ("elite", "from, s", "intervals", "took, s", "inlet", "sum", "ratio of sums", "integral", "goal")
-    return table(headings, map(_row, outcomes), title, left={"elite"})
-
-
-def _row(outcome: Outcome) -> list[str]:
-    pairs = {key: f"{value:.4g} / {outcome.volumes[key]:.4g}" for key, value in outcome.sampled.items()}
-    sampled = outcome.sampled["sum"]
-    return [
-        outcome.elite,
-        f"{outcome.start:.4g}",
-        f"{outcome.intervals}",
-        f"{outcome.seconds:.1f}",
-        pairs["inlet"],
-        pairs["sum"],
-        f"{outcome.volumes['sum'] / sampled:.4f}" if sampled else "none",
-        pairs["integral"],
-        pairs["goal"],
-    ]
+    rows = []
+    for outcome in outcomes:
+        pairs = {key: f"{value:.4g} / {outcome.volumes[key]:.4g}" for key, value in outcome.sampled.items()}
+        sampled = outcome.sampled["sum"]
+        rows.append(
+            [
+                outcome.elite,
+                f"{outcome.start:.4g}",
+                f"{outcome.intervals}",
+                f"{outcome.seconds:.1f}",
+                pairs["inlet"],
+                pairs["sum"],
+                f"{outcome.volumes['sum'] / sampled:.4f}" if sampled else "none",
+                pairs["integral"],
+                pairs["goal"],
+            ]
+        )
+    return table(headings, rows, title, left={"elite"})

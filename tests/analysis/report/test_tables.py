@@ -101,11 +101,11 @@ def test_ranks_agree_from_three_elites_on(tmp_path, sampled, shown, ranks):
     assert found is ranks or found == pytest.approx(ranks)
 
 
-def test_verification_tells_what_each_witness_saw(tmp_path):
+def test_verification_tells_what_each_simulator_saw(tmp_path):
     folder = finished(tmp_path / "run")
     assert tables.verification([read_run(folder)]) is None
     (row,) = rows(tables.verification([read_run(verify_and_disturb(folder))]))
-    assert (row["funnel"], row["witness"], row["states"], row["promise"]) == ("000", "C MuJoCo", 1020, "not refuted")
+    assert (row["funnel"], row["simulator"], row["states"], row["promise"]) == ("000", "C MuJoCo", 1020, "not refuted")
     assert (row["at most"], row["promised"], row["confidence"]) == (0.0045, 0.0043, 0.99)
 
 

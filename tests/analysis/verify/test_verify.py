@@ -1,4 +1,4 @@
-"""A funnel that holds is confirmed, one that does not is refuted, and both witnesses simulate the defined loop."""
+"""A funnel that holds is confirmed, one that does not is refuted, and both simulators simulate the defined loop."""
 # pyright: reportAttributeAccessIssue=false
 # (mujoco ships no types for its native module.)
 
@@ -28,7 +28,7 @@ INERTIA = PARAMETERS["m"] * PARAMETERS["l"] ** 2
 WEIGHT = PARAMETERS["m"] * PARAMETERS["g"] * PARAMETERS["l"]
 UPRIGHT = np.array([np.pi, 0.0])
 HELD = 0.2  # a level whose ellipsoid reaches 0.14 rad, far inside the upright's region of attraction
-WITNESSES = ("C MuJoCo", "closed form")
+SIMULATORS = ("C MuJoCo", "closed form")
 
 
 def _pendulum(x, u):
@@ -105,18 +105,18 @@ def _outcomes(elite: Elite, knots, states):
 
 def test_a_small_funnel_about_the_upright_keeps_its_promise():
     result = verify_funnel(_held(HELD), states=60)
-    assert tuple(result.outcomes) == WITNESSES
-    for witness in WITNESSES:
-        assert result.failures(witness) == 0
-        assert result.interval(witness)[0] == 0
+    assert tuple(result.outcomes) == SIMULATORS
+    for simulator in SIMULATORS:
+        assert result.failures(simulator) == 0
+        assert result.interval(simulator)[0] == 0
     assert not result.refuted
 
 
-def test_a_funnel_a_hundred_times_too_large_is_refuted_by_both_witnesses():
+def test_a_funnel_a_hundred_times_too_large_is_refuted_by_both_simulators():
     result = verify_funnel(_held(100 * HELD), states=60)
-    for witness in WITNESSES:
-        outcome = result.outcomes[witness]
-        assert result.interval(witness)[0] > result.epsilon
+    for simulator in SIMULATORS:
+        outcome = result.outcomes[simulator]
+        assert result.interval(simulator)[0] > result.epsilon
         assert outcome.left_funnel.any()
         assert outcome.missed_goal.any()
         np.testing.assert_array_equal(outcome.failed, outcome.left_funnel | outcome.left_limits | outcome.missed_goal)
@@ -124,7 +124,7 @@ def test_a_funnel_a_hundred_times_too_large_is_refuted_by_both_witnesses():
 
 
 @pytest.mark.parametrize("level", [HELD, 10 * HELD, 100 * HELD])
-def test_the_witnesses_agree_on_every_state(level):
+def test_the_simulators_agree_on_every_state(level):
     result = verify_funnel(_held(level), states=120, seed=1)
     mujoco_saw, closed_form_saw = result.outcomes.values()
     for kind in ("left_funnel", "left_limits", "missed_goal"):
@@ -132,11 +132,11 @@ def test_the_witnesses_agree_on_every_state(level):
     assert result.disagreements == 0
 
 
-@pytest.mark.parametrize(("witness", "smooth", "kinked"), [(0, 1e-6, 2e-4), (1, 1e-8, 2e-6)], ids=WITNESSES)
-def test_an_interval_under_the_loop_is_that_of_its_definition(witness, smooth, kinked):
+@pytest.mark.parametrize(("simulator", "smooth", "kinked"), [(0, 1e-6, 2e-4), (1, 1e-8, 2e-6)], ids=SIMULATORS)
+def test_an_interval_under_the_loop_is_that_of_its_definition(simulator, smooth, kinked):
     """The last state crosses the torque limit inside a step: there a method of any order is one of the second."""
     elite = _moving()
-    _, f, march, _ = list(simulators_of(elite, 4))[witness]
+    _, f, march, _ = list(simulators_of(elite, 4))[simulator]
     offsets = np.array([[0.0, 0.0], [0.05, -0.1], [-0.1, 0.2], [0.6, 1.0]])
     tolerances = np.array([smooth, smooth, smooth, kinked])[:, None]
     for k in range(len(elite.u)):
