@@ -89,7 +89,8 @@ def short_interval(
     g3 = mm(a, g2) + mm(g2, at) - 2 * mm(spread, qg)
     a2 = mm(a, a) - gq
     a3 = mm(a, a2) - mm(g2, cost) - 2 * mm(gq, a)
-    t, tt, ttt = duration, duration**2 / 2, duration**3 / 6
+    t = jnp.asarray(duration, a.dtype)
+    tt, ttt = t**2 / 2, t**3 / 6
     return Interval(
         transition=_identity(a) + t * a + tt * a2 + ttt * a3,
         spread=t * g1 + tt * g2 + ttt * g3,
