@@ -324,7 +324,7 @@ def audited(tmp_path_factory):
     ],
 )
 def test_every_verb_reads_the_audited_folder(audited, verb, arguments, made, monkeypatch):
-    monkeypatch.setattr(cli, "prepare_jax", lambda *_: None)
+    monkeypatch.setattr(cli, "prepare_jax", lambda *_, **__: None)
     given = [argument.replace("{run}", str(audited)) for argument in arguments]
     assert cli.main([verb, str(audited), *given]) == 0
     assert (audited / made).exists()

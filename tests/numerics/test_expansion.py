@@ -36,10 +36,10 @@ def dense(entries):
 def point():
     random = np.random.default_rng(0)
     return (
-        random.normal(size=(n, P)),
-        random.normal(size=(m, P)),
-        random.uniform(0.1, 0.5, P),
-        random.normal(size=(n, P)),
+        jnp.asarray(random.normal(size=(n, P))),
+        jnp.asarray(random.normal(size=(m, P))),
+        jnp.asarray(random.uniform(0.1, 0.5, P)),
+        jnp.asarray(random.normal(size=(n, P))),
     )
 
 

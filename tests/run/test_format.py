@@ -4,6 +4,7 @@ import dataclasses
 import json
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.stats
@@ -37,7 +38,7 @@ def record():
 def test_the_policy_of_the_record_is_the_candidate_s():
     """Where the search chose it; else the configuration's, as everywhere in this box."""
     evaluation, fixed = _row(pipeline.RTCD), {"input_weight": 1.0, "authority": 1.0, "discount": 0.0}
-    chosen = dataclasses.replace(evaluation.candidate, policy={"authority": np.float64(0.25)})
+    chosen = dataclasses.replace(evaluation.candidate, policy={"authority": jnp.asarray(0.25)})
     assert record_of(pipeline.problem(), evaluation)["policy"] == fixed
     searched = dataclasses.replace(evaluation, candidate=chosen)
     assert plain(record_of(pipeline.problem(), searched)["policy"]) == {**fixed, "authority": 0.25}
