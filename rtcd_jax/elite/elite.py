@@ -24,6 +24,10 @@ class NoFunnel(UserError):
         self.status = status
 
 
+LARGEST = 1e12
+"""Of a robot's and a controller's numbers, in SI units."""
+
+
 @final
 @dataclass(frozen=True, eq=False)
 class Elite:
@@ -183,6 +187,11 @@ def _quadratic(weight: np.ndarray, error: np.ndarray) -> np.ndarray:
     return np.einsum("si,ij,sj->s", error, weight, error)
 
 
+def _is_measurable(value: Any) -> bool:
+    """Whether it is a number that a robot or its controller can have: its products do not overflow."""
+    return isinstance(value, float | int) and abs(value) <= LARGEST
+
+
 def _require_kinds(record: Mapping[str, Any]) -> None:
     """Raises UserError where a value of `NNN.json` is of another kind than a run writes."""
     kinds = {"plant": str, "parameters": Mapping, "policy": Mapping, "state_limits": list, "epsilon": float | int,
@@ -190,12 +199,12 @@ def _require_kinds(record: Mapping[str, Any]) -> None:
     stored = {key: value for key in kinds if (value := record.get(key)) is not None}
     wrong = [key for key, value in stored.items() if not isinstance(value, kinds[key])]
     for key in {"parameters", "policy"} & stored.keys() - set(wrong):
-        wrong += [f"{key}.{name}" for name, value in stored[key].items() if not isinstance(value, float | int)]
+        wrong += [f"{key}.{name}" for name, value in stored[key].items() if not _is_measurable(value)]
     if not wrong and not all(
         limit is None or isinstance(limit, float | int) for limit in stored.get("state_limits", ())
     ):
         wrong.append("state_limits")
     if wrong:
         raise UserError(
-            f"the elite's {', '.join(map(printable, wrong))} cannot be read: of another kind than a run writes"
+            f"the elite's {', '.join(map(printable, wrong))} cannot be read: of another kind or size than a run writes"
         )

@@ -19,7 +19,7 @@ import numpy as np
 
 from rtcd_jax.config import load as configuration
 from rtcd_jax.config.load import Config
-from rtcd_jax.system.errors import UserError
+from rtcd_jax.system.errors import UserError, printable
 from rtcd_jax.system.files import read_json, reading, replace, replace_json
 
 FORMAT = "rtcd_jax run"
@@ -68,6 +68,9 @@ def read_elite(folder: Path, name: str) -> tuple[dict[str, np.ndarray], dict[str
         raise UserError(f"{folder} has no {name}.npz with its {name}.json; there is {there}")
     with reading(paths[0], _RESTORE), paths[0].open("rb") as file, np.load(file, allow_pickle=False) as stored:
         arrays = dict(stored)
+    words = [name for name, array in arrays.items() if not np.issubdtype(array.dtype, np.number)]
+    if words:
+        raise UserError(f"cannot read {paths[0]}: {printable(', '.join(words))} must be numbers; {_RESTORE}")
     record = read_json(paths[1], _RESTORE)
     if not record:
         raise UserError(f"{paths[1]} says nothing of its elite; {_RESTORE}")

@@ -6,6 +6,7 @@ import json
 import math
 import os
 import zipfile
+import zlib
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -81,6 +82,10 @@ def read_json(path: Path, advice: str) -> dict[str, Any]:
         return found
 
 
+_DAMAGED = OSError, EOFError, KeyError, TypeError, ValueError, RecursionError, NotImplementedError
+"""What Python's and numpy's readers raise over bytes that nobody has written."""
+
+
 @contextlib.contextmanager
 def reading(path: Path, advice: str) -> Iterator[None]:
     """Turns what a damaged file raises into one error that names it and ends with `advice`."""
@@ -88,7 +93,7 @@ def reading(path: Path, advice: str) -> Iterator[None]:
         yield
     except UserError:
         raise
-    except (OSError, EOFError, KeyError, TypeError, ValueError, RecursionError, zipfile.BadZipFile) as error:
+    except (*_DAMAGED, zipfile.BadZipFile, zlib.error) as error:
         lacks = "it lacks " if isinstance(error, KeyError) else ""
         told = getattr(error, "strerror", None) or lacks + " ".join(str(error).split()) or type(error).__name__
         raise UserError(f"cannot read {path}: {told}; {advice}") from error

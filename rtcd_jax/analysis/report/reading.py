@@ -43,7 +43,11 @@ _OF_A_GENERATION = (
 
 _NUMBER = int | float | None
 _ANY_KEY = "*"
-_PROVENANCE = {"starts": [{"seconds": int | float, "versions": {}}]}
+_PLAIN = str | int | float | None
+_START = dict.fromkeys(("time", "commit", "devices", "device", "precision", "system"), _PLAIN)
+_PROVENANCE = {
+    "config_hash": str | None, "starts": [{**_START, "seconds": int | float, "versions": {_ANY_KEY: _PLAIN}}],
+}  # fmt: skip
 _COUNTS = dict.fromkeys(("left_funnel", "left_limits", "missed_goal", "rate", "rate_lower", "rate_upper"), _NUMBER)
 _VERIFICATION = {
     "states": _NUMBER, "epsilon": _NUMBER, "confidence": _NUMBER, "witnesses": {_ANY_KEY: _COUNTS},
