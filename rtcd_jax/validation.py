@@ -9,7 +9,6 @@ probability of at most R (1 - epsilon)^M, whatever the rounds before did to them
 
 import dataclasses
 from collections.abc import Callable
-from functools import partial
 from typing import NamedTuple
 
 import equinox as eqx
@@ -28,6 +27,9 @@ from rtcd_jax.types import Candidate, Policy, Status
 
 SAFETY = 0.98
 """Level over that of the lowest held-out sample that failed."""
+
+CHEAP_ROUNDS = 20
+"""On average at most, before each round on which epsilon rests."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -151,30 +153,31 @@ def validate_paths(
 ) -> tuple[Float[Array, " knots"], Int[Array, " knots"]]:
     """Levels and samples after held-out states of all knots were followed to the goal, by the closed form.
 
-    First in rounds of `budget.funnel.trials` states a knot, which are cheap, until one is clean, then in rounds of
-    `samples_per_knot` (a number or a tracer; the budget's), on which epsilon rests.
+    In rounds of `samples_per_knot` (a number or a tracer; the budget's), on which epsilon rests. Before each of them
+    come cheap ones of `budget.funnel.trials` states a knot, until one is clean.
 
     A state fails if it leaves the funnel at a later knot, leaves the boxes, or does not come closer to the goal (by its
     V) over the horizon after t_N. Wherever a path leaves the funnel, the level from which it left is the one to shrink:
     paths of many knots run together, into corners that states uniform in that knot's ellipsoid hardly visit.
 
-    The states of a round go in batches, knot by knot from the first one: a batch starts at the first knot of its own,
-    and only its states are held in memory. Each finds the levels as the batches before left them.
+    The states of a round go in batches, knot by knot from the last one, since a path needs the levels of later knots
+    alone: each batch finds the levels as the batches before left them, and a round without failures leaves them as they
+    were. A batch starts at the first knot of its own, and only its states are held in memory. A round on which epsilon
+    would rest begins with the knots that failed in the last such round and ends with the first knot that fails, so that
+    nearly all of the work is the clean round's.
     """
     knots, most = levels.shape[0], budget.samples_per_knot
     batch = min(budget.batch, knots * most)
-    last_count = most if samples_per_knot is None else samples_per_knot
-    counts = jnp.stack([jnp.asarray(min(budget.funnel.trials, most), int), jnp.asarray(last_count, int)])
+    last_count = jnp.asarray(most if samples_per_knot is None else samples_per_knot, int)
+    first_count = jnp.asarray(min(budget.funnel.trials, most), int)
     dynamics = rollout.closed_form(rollouts.problem.plant)
 
     # Without a funnel no round would ever be clean.
     hopeful = (rollouts.policy.status == Status.OK) & jnp.all(jnp.isfinite(levels) & (levels > 0))
-    rounds = jnp.where(hopeful, budget.rounds, 0)
 
-    def one_batch(number, carry):
-        levels, failures, begun, count, key = carry
-        born = jnp.minimum((number * batch + np.arange(batch)) // count, knots - 1)  # the last batch is filled up
-        x = rollouts.uniform(begun, born, jax.random.fold_in(key, number))
+    def follow(levels, born, key):
+        """Levels below those of states of the knots `born` that failed, and which of these states did."""
+        x = rollouts.uniform(levels, born, key)
 
         def forward(k, state):
             x, values, inside = state
@@ -184,7 +187,7 @@ def validate_paths(
             return jnp.where(started, ends, x), values, inside.at[k].set(within)
 
         blank = jnp.zeros((knots - 1, batch), x.dtype), jnp.zeros((knots - 1, batch), bool)
-        x, values, inside = jax.lax.fori_loop(born[0], knots - 1, forward, (x, *blank))
+        x, values, inside = jax.lax.fori_loop(jnp.min(born), knots - 1, forward, (x, *blank))
         _, arrives = rollouts.arrive(x, dynamics)
         last = rollouts.level(x, knots - 1)
         final = _below(levels[-1], last, ~arrives)
@@ -198,19 +201,63 @@ def validate_paths(
 
         rows = jnp.arange(knots - 1), levels[:-1], values, inside
         (_, _, failed), shrunk = jax.lax.scan(backward, (final, last, ~arrives), rows, reverse=True)
-        return jnp.append(shrunk, final), failures.at[born].add(failed), begun, count, key
+        return jnp.append(shrunk, final), failed
 
-    def one_round(count, levels, key):
-        start = levels, jnp.zeros(knots, int), levels, count, key
-        return jax.lax.fori_loop(0, -(-knots * count // batch), one_batch, start)[:2]
+    def one_round(levels, count, order, stops, key):
+        """Levels and failures [K] after `count` states of each knot, the knots in the `order` given."""
 
-    def stage(levels, now):
-        count, key = now
-        done = _repeat(partial(one_round, count), levels, key, rounds)
-        return done.levels, jnp.where(done.failures == 0, count, 0)
+        def goes_on(carry):
+            number, _, failures = carry
+            ends_a_knot = (number * batch) % count < batch
+            spoilt = stops & ends_a_knot & jnp.any(failures > 0)
+            return (number * batch < knots * count) & ~spoilt
 
-    levels, samples = jax.lax.scan(stage, levels, (counts, jax.random.split(key, 2)))
-    return levels, samples[-1].astype(jnp.int32)
+        def one_batch(carry):
+            number, levels, failures = carry
+            place = (number * batch + np.arange(batch)) // count
+            born = order[jnp.minimum(place, knots - 1)]  # the last batch is filled up
+            levels, failed = follow(levels, born, jax.random.fold_in(key, number))
+            return number + 1, levels, failures.at[born].add(failed)
+
+        start = 0, levels, jnp.zeros(knots, int)
+        return jax.lax.while_loop(goes_on, one_batch, start)[1:]
+
+    def again(state):
+        decides = state.settled
+        failed_before = jnp.where(decides, state.failures, 0)[::-1]
+        order = knots - 1 - jnp.argsort(-failed_before, stable=True)
+        count = jnp.where(decides, last_count, first_count)
+        number = state.cheap + state.decisive
+        levels, failures = one_round(state.levels, count, order, decides, jax.random.fold_in(key, number))
+        clean = jnp.all(failures == 0)
+        cheap = state.cheap + ~decides
+        return _Followed(
+            levels,
+            jnp.where(decides, failures, state.failures),
+            settled=~decides & (clean | (cheap >= CHEAP_ROUNDS * (state.decisive + 1))),
+            done=decides & clean,
+            cheap=cheap,
+            decisive=state.decisive + decides,
+        )
+
+    def goes_on(state: _Followed) -> Bool[Array, ""]:
+        return hopeful & ~state.done & (state.decisive < budget.rounds)
+
+    no, none = jnp.asarray(False), jnp.asarray(0)
+    last = jax.lax.while_loop(goes_on, again, _Followed(levels, jnp.zeros(knots, int), no, no, none, none))
+    samples = jnp.where(last.done, last_count, 0)
+    return last.levels, jnp.broadcast_to(samples, knots).astype(jnp.int32)
+
+
+class _Followed(NamedTuple):
+    """`failures` of the last round that decides; `settled`: the last cheap one was clean, or there were enough."""
+
+    levels: Float[Array, " knots"]
+    failures: Int[Array, " knots"]
+    settled: Bool[Array, ""]
+    done: Bool[Array, ""]
+    cheap: Int[Array, ""]
+    decisive: Int[Array, ""]
 
 
 class PhysicsComparison(eqx.Module):

@@ -138,8 +138,8 @@ def test_a_shrunk_level_has_no_trials(verb, hasty):
     levels, trials = hasty(inflated)
     assert levels[3] < inflated[3]
     assert trials[3] == 0
-    # Shrinking a level fails states that came into it from before, none that start behind.
-    np.testing.assert_array_equal(trials[4:], _tried(verb)[4:])
+    # Shrinking a level fails states that came into it from before, none that start behind; paths' rounds count whole.
+    np.testing.assert_array_equal(trials[4:], _tried(verb)[4:] if verb == "intervals" else 0)
 
 
 def test_what_was_not_tried_has_no_trials(verb):
