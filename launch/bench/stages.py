@@ -19,7 +19,8 @@ def main() -> None:
     parser.add_argument("--results", type=Path, default=RESULTS, help="folder of the JSON file")
     arguments = parser.parse_args()
     prepare_jax(1)
-    from rtcd_jax.analysis.scale.stages import stages
+    from pipeline_stages import stages
+
     from rtcd_jax.config.load import load
 
     rows = []

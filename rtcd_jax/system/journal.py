@@ -1,40 +1,54 @@
 """The finished steps of a long task on disk, so that a killed one goes on."""
 
-import contextlib
 import itertools
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, final
 
-from rtcd_jax.system.files import replace, writing
+from rtcd_jax.system.files import reading, replace, writing
 
 
 @final
 class Journal:
-    """One JSON line a step; the first line, the head, says of which task.
+    """One JSON line a step, in `lines`: those of former calls, followed by those of this one.
 
-    Lines of another task are dropped, and what follows a torn one.
+    With a `head`, the file is of one task: its first line is the head, lines of another task are dropped, and so is
+    what follows a damaged line. Without one it collects the lines of many tasks, and only damaged lines are dropped.
     """
 
-    def __init__(self, path: Path, head: Mapping[str, Any]):
+    def __init__(self, path: Path, head: Mapping[str, Any] | None = None):
         self.path = path
-        lines = list(_whole(path)) if path.is_file() else []
-        self.lines = lines[1:] if lines and lines[0] == head else []
-        replace(path, "".join(f"{json.dumps(line)}\n" for line in (head, *self.lines)).encode())
+        content = b""
+        if path.is_file():
+            with reading(path, "remove it"):
+                content = path.read_bytes()
+        stored = [_parsed(line) for line in content.splitlines(keepends=True)]
+        if head is not None:
+            former = itertools.takewhile(lambda line: line is not None, stored[1:])
+            stored = [head, *former] if stored[:1] == [head] else [head]
+        whole = [line for line in stored if line is not None]
+        self.lines = whole if head is None else whole[1:]
+        if (cleaned := b"".join(map(_written, whole))) != content:
+            replace(path, cleaned)
 
     def append(self, line: Mapping[str, Any]) -> None:
         self.lines.append(dict(line))
         with writing(self.path), self.path.open("ab") as file:
-            file.write(f"{json.dumps(line)}\n".encode())
+            file.write(_written(line))
 
     def close(self) -> None:
         """The task is finished, and its file is gone."""
-        self.path.unlink()
+        self.path.unlink(missing_ok=True)
 
 
-def _whole(path: Path) -> Iterator[dict[str, Any]]:
-    """A journal's lines up to the first one that is torn or damaged."""
-    with path.open("rb") as file, contextlib.suppress(TypeError, ValueError):
-        for line in itertools.takewhile(lambda line: line.endswith(b"\n"), file):
-            yield dict(json.loads(line))
+def _written(line: Mapping[str, Any]) -> bytes:
+    return f"{json.dumps(line)}\n".encode()
+
+
+def _parsed(line: bytes) -> dict[str, Any] | None:
+    """None for a line that is torn or damaged."""
+    try:
+        return dict(json.loads(line)) if line.endswith(b"\n") else None
+    except (TypeError, ValueError, RecursionError):
+        return None

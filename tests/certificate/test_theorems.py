@@ -7,6 +7,7 @@ from scipy.integrate import solve_ivp
 from rtcd_jax.certificate import check
 from rtcd_jax.certificate.check import GramCertificate, Obligation, Q, Refused, polynomial
 from rtcd_jax.certificate.prove import sdp as program
+from tests.certificate.cvxpy_program import CvxpyProgram
 
 NOTHING = Q(0)
 
@@ -43,7 +44,7 @@ def motzkin():
 
 
 def test_motzkin_is_refused_until_it_is_multiplied():
-    cvxpy = [program.CvxpyProgram(program.shape_of(motzkin(), degree, 0, 0)).margin(motzkin()) for degree in (3, 4)]
+    cvxpy = [CvxpyProgram(program.shape_of(motzkin(), degree, 0, 0)).margin(motzkin()) for degree in (3, 4)]
     assert cvxpy[0] < -1e-3
     assert cvxpy[1] == pytest.approx(0, abs=1e-5)
     assert shown(motzkin(), 3) is None
@@ -55,7 +56,7 @@ def lifted(amount):
 
 
 def test_motzkin_lifted_by_what_it_lacks():
-    lack = -program.CvxpyProgram(program.shape_of(motzkin(), 3, 0, 0)).margin(motzkin())
+    lack = -CvxpyProgram(program.shape_of(motzkin(), 3, 0, 0)).margin(motzkin())
     assert shown(lifted(1.01 * lack), 3) > 0
     assert shown(lifted(0.99 * lack), 3) is None
 
@@ -130,14 +131,14 @@ def test_conditions_hold_by_multipliers_and_cvxpy_agrees_with_clarabel():
         todo = ellipse_in_a_case(threshold)
         shape = program.shape_of(todo, 2, 3, 1)
         expected = 0.5 + threshold - 0.01
-        assert program.CvxpyProgram(shape).margin(todo) == pytest.approx(expected, abs=1e-5)
+        assert CvxpyProgram(shape).margin(todo) == pytest.approx(expected, abs=1e-5)
         margin = shown(todo, 2, 3, 1)
         assert (margin == pytest.approx(expected, abs=1e-5)) if sign > 0 else (margin is None)
 
 
 def test_a_program_is_compiled_once():
     shape = program.shape_of(cubic(0.5), 1, 2, 0)
-    compiled = program.CvxpyProgram(shape)
+    compiled = CvxpyProgram(shape)
     for level in (0.3, 0.9, 1.2):
         assert compiled.margin(cubic(level)) == pytest.approx(2 - 2 * level, abs=1e-5)
 

@@ -1,4 +1,4 @@
-"""`rtcd scale`: a grid of points, kept as they are measured, a table and figures."""
+"""`rtcd scale`: a grid of points, stored as they are measured, a table and figures."""
 
 import csv
 import io
@@ -8,14 +8,15 @@ import platform
 import statistics
 import subprocess
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from rtcd_jax.analysis.scale.figures import draw
 from rtcd_jax.config.load import Config, config_hash
 from rtcd_jax.system.console import Clock, Console, Progress, duration, table
-from rtcd_jax.system.files import make_folder, plain, replace, writing
+from rtcd_jax.system.files import make_folder, plain, replace
+from rtcd_jax.system.journal import Journal
 
 POINTS, TABLE = "points.jsonl", "table.csv"
 OUT_OF_MEMORY = "out of memory"
@@ -36,37 +37,28 @@ def study(
     """
     mark = {"config_hash": config_hash(config), "machine": platform.node(), "repeats": repeats}
     make_folder(folder)
-    found = {_place(point): point for point in _kept(folder / POINTS, mark)}
+    journal = Journal(folder / POINTS)
+    measured = {
+        _place(point): point for point in journal.lines if point.items() >= mark.items() and "failed" not in point
+    }
     grid = [(population, count) for population in sorted(set(populations)) for count in sorted(set(devices))]
     clock = Clock()
     for index, (population, count) in enumerate(grid):
-        if (population, count) not in found:
+        if (population, count) not in measured:
             console.message(f"population {population}, {count} devices: a process of its own, which compiles first")
             point = mark | {"load": os.getloadavg()[0]}
             with console.waiting("compiling and measuring"):
                 point |= _measured(path, population, count, repeats)
-            with writing(folder / POINTS), (folder / POINTS).open("a") as file:
-                file.write(json.dumps(plain(point)) + "\n")
-            found[population, count] = point
+            journal.append(plain(point))
+            measured[population, count] = point
         done, total = index + 1, len(grid)
-        text = f"point {done}/{total}: {_sentence(found[population, count])}  elapsed {duration(clock.elapsed)}"
+        text = f"point {done}/{total}: {_sentence(measured[population, count])}  elapsed {duration(clock.elapsed)}"
         console.progress(Progress(done, total, text))
-    rows = [row_of(found[place]) for place in grid]
+    rows = [row_of(measured[place]) for place in grid]
     _write_table(folder / TABLE, rows)
     pictures = draw(rows, folder)
     console.message(_table(rows))
     console.message(f"{folder / TABLE}, {', '.join(path.name for path in pictures)}")
-
-
-def _kept(path: Path, mark: Point) -> Iterator[Point]:
-    if path.is_file():
-        for line in path.read_text(encoding="utf-8", errors="replace").splitlines():
-            try:
-                point = dict(json.loads(line))
-            except (TypeError, ValueError):  # torn by a kill: that point is measured again
-                continue
-            if {key: point.get(key) for key in mark} == mark and "failed" not in point:
-                yield point
 
 
 def _place(point: Point) -> tuple[int, int]:

@@ -1,12 +1,10 @@
-"""`rtcd verify`: all chunks of a run's trials on all cores; what is done is kept, so that a stopped one goes on."""
+"""`rtcd verify`: all chunks of a run's trials on all cores; a stopped one goes on from its journals."""
 
-import contextlib
 import functools
 import hashlib
-import io
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import as_completed
-from dataclasses import asdict
+from dataclasses import asdict, fields
 from pathlib import Path
 from typing import NamedTuple, final
 
@@ -17,12 +15,14 @@ from rtcd_jax.elite.closed_loop import Outcome
 from rtcd_jax.elite.elite import Elite, NoFunnel
 from rtcd_jax.elite.records import INITIAL, elite_folder, require_elites
 from rtcd_jax.system.console import Clock, Console, Progress, table
-from rtcd_jax.system.errors import UserError
-from rtcd_jax.system.files import make_folder, reading, replace, replace_json, writing
+from rtcd_jax.system.files import make_folder, plain, replace_json
+from rtcd_jax.system.journal import Journal
 from rtcd_jax.system.processes import processes
 
 FUNNELS = "000", INITIAL
 """Which funnels of a run are verified."""
+KINDS = tuple(field.name for field in fields(Outcome))
+"""Of failures."""
 
 
 @final
@@ -40,38 +40,37 @@ class Job(NamedTuple):
 def verify_run(folder: Path, states: int, seed: int, workers: int, console: Console) -> bool:
     """Verifies a run's best elite and its initial candidate; True if no promise was refuted.
 
-    Stores `verification/000.json` and `verification/initial.json`, and until then every finished chunk in
-    `verification/.parts`, from where the same call goes on. The workers' number changes nothing. An initial candidate
-    without a funnel is reported instead.
+    Stores `verification/000.json` and `verification/initial.json`. Until then a journal beside each has the finished
+    chunks, from where the same call goes on. The workers' number changes nothing. An initial candidate without a funnel
+    is reported instead.
 
     Raises:
         UserError: no run folder, a run without elites, or a folder that cannot be read or written.
     """
     require_elites(folder)
-    parts = folder / "verification" / ".parts"
-    make_folder(parts)
-    trials = {}
+    make_folder(folder / "verification")
+    trials, journals = {}, {}
     for funnel in FUNNELS:
         try:
             trials[funnel] = _trial(folder, funnel, states, seed)
         except NoFunnel as error:
             console.message(f"{funnel}: nothing to verify, it has no funnel ({error.status})")
+        else:
+            journals[funnel] = _journal(folder, funnel, trials[funnel])
     jobs = [
         Job(folder, funnel, states, seed, simulator, chunk)
         for funnel, trial in trials.items()
         for simulator in trial.names
         for chunk in range(trial.chunks)
     ]
-    outcomes = _outcomes(jobs, parts, workers, console)
+    outcomes = _outcomes(jobs, journals, workers, console)
     verifications = {}
     for funnel, trial in trials.items():
-        found = {(job.simulator, job.chunk): seen for job, seen in outcomes.items() if job.funnel == funnel}
-        verifications[funnel] = trial.verification(found)
+        by_chunk = {(job.simulator, job.chunk): outcomes[job] for job in jobs if job.funnel == funnel}
+        verifications[funnel] = trial.verification(by_chunk)
         replace_json(folder / "verification" / f"{funnel}.json", verifications[funnel].record())
-    with writing(parts):
-        for part in parts.iterdir():
-            part.unlink()
-        parts.rmdir()
+    for journal in journals.values():
+        journal.close()
     if verifications:
         console.message(_table(verifications))
         console.message(f"stored: {', '.join(f'{folder}/verification/{name}.json' for name in verifications)}")
@@ -83,54 +82,47 @@ def _trial(folder: Path, funnel: str, states: int, seed: int) -> Trial:
     return Trial(Elite.read(folder, funnel), states, seed)
 
 
-def _outcomes(jobs: Sequence[Job], parts: Path, workers: int, console: Console) -> dict[Job, Outcome]:
-    """Of all jobs, those that are kept already read, the others done and kept."""
-    found = {job: seen for job in jobs if (seen := _kept(_part(parts, job))) is not None}
-    clock, total = Clock(before=len(found)), len(jobs)
-    for job, seen in _done([job for job in jobs if job not in found], workers):
-        _keep(_part(parts, job), seen)
-        found[job] = seen
-        failures = sum(int(each.failed.sum()) for each in found.values())
-        text = f"{len(found)}/{total} chunks of states  {failures} failures  {clock.times(len(found), total)}"
-        console.progress(Progress(len(found), total, text))
-    return {job: found[job] for job in jobs}
+def _journal(run: Path, funnel: str, trial: Trial) -> Journal:
+    """Of a funnel's finished chunks; its head is all that their outcomes depend on."""
+    files = [elite_folder(run, funnel) / f"{funnel}.{suffix}" for suffix in ("npz", "json")]
+    digests = [hashlib.sha256(file.read_bytes()).hexdigest() for file in files]
+    head = {"funnel": digests, "states": trial.states, "seed": trial.seed, "chunks": trial.chunks}
+    return Journal(run / "verification" / f".{funnel}.partial.jsonl", head)
 
 
-def _done(jobs: Sequence[Job], workers: int) -> Iterator[tuple[Job, Outcome]]:
+def _outcomes(
+    jobs: Sequence[Job], journals: Mapping[str, Journal], workers: int, console: Console
+) -> dict[Job, Outcome]:
+    """Of all jobs: from the journals where they are finished, the others simulated and added there."""
+    finished = {
+        (funnel, line["simulator"], line["chunk"]): Outcome(**{name: np.array(line[name]) for name in KINDS})
+        for funnel, journal in journals.items()
+        for line in journal.lines
+    }
+    outcomes = {job: finished[key] for job in jobs if (key := (job.funnel, job.simulator, job.chunk)) in finished}
+    clock, total = Clock(before=len(outcomes)), len(jobs)
+    for job, outcome in _simulated([job for job in jobs if job not in outcomes], workers):
+        journals[job.funnel].append({"simulator": job.simulator, "chunk": job.chunk, **plain(asdict(outcome))})
+        outcomes[job] = outcome
+        failures = sum(int(each.failed.sum()) for each in outcomes.values())
+        text = f"{len(outcomes)}/{total} chunks of states  {failures} failures  {clock.times(len(outcomes), total)}"
+        console.progress(Progress(len(outcomes), total, text))
+    return outcomes
+
+
+def _simulated(jobs: Sequence[Job], workers: int) -> Iterator[tuple[Job, Outcome]]:
     """The jobs with their outcomes, as they come; in this process if there is nothing to share out."""
     if min(workers, len(jobs)) <= 1:
-        yield from ((job, _do(job)) for job in jobs)
+        yield from ((job, _simulate(job)) for job in jobs)
         return
     with processes(min(workers, len(jobs))) as pool:
-        waiting = {pool.submit(_do, job): job for job in jobs}
+        waiting = {pool.submit(_simulate, job): job for job in jobs}
         for future in as_completed(waiting):
             yield waiting[future], future.result()
 
 
-def _do(job: Job) -> Outcome:
+def _simulate(job: Job) -> Outcome:
     return _trial(job.run, job.funnel, job.states, job.seed).outcome(job.simulator, job.chunk)
-
-
-def _part(parts: Path, job: Job) -> Path:
-    """Named by all that its contents depend on."""
-    folder = elite_folder(job.run, job.funnel)
-    mark = hashlib.sha256(repr(job[1:]).encode())
-    for suffix in ("npz", "json"):
-        mark.update((folder / f"{job.funnel}.{suffix}").read_bytes())
-    return parts / f"{mark.hexdigest()[:24]}.npz"
-
-
-def _keep(part: Path, outcome: Outcome) -> None:
-    file = io.BytesIO()
-    np.savez(file, **asdict(outcome))
-    replace(part, file.getvalue())
-
-
-def _kept(part: Path) -> Outcome | None:
-    """None for what is not there, or is damaged: it is made again."""
-    with contextlib.suppress(UserError), reading(part, "make it again"), np.load(part, allow_pickle=False) as stored:
-        return Outcome(**stored)
-    return None
 
 
 def _table(verifications: Mapping[str, Verification]) -> str:

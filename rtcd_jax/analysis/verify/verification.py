@@ -132,15 +132,3 @@ class Trial:
             for chunk in range(self.chunks):
                 seen[chunk :: self.chunks] = getattr(outcomes[name, chunk], field)
         return Outcome(**whole)
-
-
-def verify_funnel(elite: Elite, states: int = 1000, seed: int = 0) -> Verification:
-    """Simulates `states` held-out states of the funnel by every simulator that knows the plant, in this process.
-
-    Raises:
-        UserError: fewer states than knots, or a goal that its own LQR does not hold.
-        ValueError: an unknown plant.
-    """
-    trial = Trial(elite, states, seed)
-    pairs = [(name, chunk) for name in trial.names for chunk in range(trial.chunks)]
-    return trial.verification({pair: trial.outcome(*pair) for pair in pairs})

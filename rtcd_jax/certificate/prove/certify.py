@@ -22,7 +22,6 @@ from rtcd_jax.elite.elite import Elite
 from rtcd_jax.system.files import replace
 from rtcd_jax.system.journal import Journal
 
-RUNGS = ("certified", "proved")
 COARSER = 2
 """Stride of the directions for funnels that are not proved yet."""
 

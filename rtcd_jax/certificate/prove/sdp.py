@@ -6,8 +6,7 @@ maximize t  such that, for every Bernstein index j and modulo |y|^2 = 1,
     sigma_i = sum_a B_a(s) z'S_ia z,    S_ia >= 0
 
 (check has the theorem). The time s stays outside the Gram matrices, and the sphere makes them small: with monomials
-up to degree 3, 7 rows for two states and 30 for four. `solve` hands the program to Clarabel; `CvxpyProgram` is the
-same program as cvxpy states it, built once and solved for many data.
+up to degree 3, 7 rows for two states and 30 for four. `solve` hands the program to Clarabel.
 """
 
 # pyright: reportAttributeAccessIssue=false, reportOptionalSubscript=false
@@ -15,8 +14,8 @@ same program as cvxpy states it, built once and solved for many data.
 
 import math
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
-from typing import Any, NamedTuple, cast, final
+from functools import lru_cache
+from typing import Any, NamedTuple, final
 
 import numpy as np
 import scipy.sparse as sp
@@ -210,54 +209,3 @@ def _exact(rows: int, triangle: np.ndarray) -> list[list]:
     lift = max(LIFT, LIFT - float(np.linalg.eigvalsh(matrix)[0]))
     grid = np.rint((matrix + lift * np.eye(rows)) * 2.0**GRID)
     return [[Q(int(c), 1 << GRID) for c in row] for row in grid]
-
-
-@final
-class CvxpyProgram:
-    """The program of a shape, compiled once; `margin` solves it for an obligation's data."""
-
-    def __init__(self, shape: Shape):
-        self.shape = shape
-
-    @cached_property
-    def _problem(self):
-        import cvxpy as cp
-
-        shape = self.shape
-        gram, maps = _cvxpy_maps(shape.n, shape.degree, 0), _cvxpy_maps(shape.n, shape.degree - 1, 1)
-        rows, sides = (len(check.monomials(shape.n, d)) for d in (shape.degree, shape.degree - 1))
-        high, rest = shape.multiplier, shape.bernstein - shape.multiplier
-        p = cp.Parameter((shape.bernstein + 1, gram[0].shape[0]))
-        g = [cp.Parameter((rest + 1, len(maps))) for _ in range(shape.constraints)]
-        t = cp.Variable()
-        grams = [cp.Variable((rows, rows), PSD=True) for _ in range(shape.bernstein + 1)]
-        sigmas = [[cp.Variable((sides, sides), PSD=True) for _ in range(high + 1)] for _ in g]
-        first = np.eye(gram[0].shape[0])[0]
-        sums = [gram[0] @ cp.vec(each, order="C") + t * first for each in grams]
-        for parameter, column in zip(g, sigmas, strict=True):
-            for a, sigma in enumerate(column):
-                for b in range(rest + 1):
-                    weight = math.comb(high, a) * math.comb(rest, b) / math.comb(high + rest, a + b)
-                    for m, each in enumerate(maps):
-                        sums[a + b] += weight * parameter[b, m] * (each @ cp.vec(sigma, order="C"))
-        return cp.Problem(cp.Maximize(t), [s == p[j] for j, s in enumerate(sums)]), p, g
-
-    def margin(self, todo: Obligation) -> float:
-        """The largest t; -inf if the program is infeasible."""
-        problem, p, g = self._problem
-        data = data_of(todo, self.shape)
-        p.value = data.p
-        for parameter, value in zip(g, data.g, strict=True):
-            parameter.value = value
-        return float(cast(float, problem.solve(solver="CLARABEL", ignore_dpp=False)))
-
-
-def _cvxpy_maps(n: int, degree: int, side: int) -> list[sp.csc_matrix]:
-    """`_product_map` for a full matrix row by row in the place of a scaled triangle."""
-    rows = len(check.monomials(n, degree))
-    columns = np.zeros((rows * (rows + 1) // 2, rows * rows))
-    for k, (i, j) in enumerate(_triangle(rows)):
-        columns[k, i * rows + j] += 0.5 * (1 if i == j else SQRT2)
-        columns[k, j * rows + i] += 0.5 * (1 if i == j else SQRT2)
-    top = 2 * degree + (2 if side else 0)
-    return [m @ sp.csc_matrix(columns) for m in _product_map(n, degree, side, top)]

@@ -86,6 +86,18 @@ def test_a_study_leaves_points_table_and_figures_and_goes_on_where_it_stopped(tm
     assert asked[4:] == [(32, 1)]
 
 
+def test_a_line_that_a_kill_has_torn_costs_its_point_alone(tmp_path, monkeypatch):
+    config = parse_yaml(EXAMPLE)
+    asked = answering(monkeypatch, measured)
+    study(tmp_path / "x.yaml", config, (32, 64), (1,), 3, tmp_path, Screen().console)
+    points = tmp_path / "points.jsonl"
+    first, second = points.read_bytes().splitlines(keepends=True)
+    points.write_bytes(second[:30] + b"\n" + first + second[:-9])
+    for _ in range(2):
+        study(tmp_path / "x.yaml", config, (32, 64), (1,), 3, tmp_path, Screen().console)
+    assert asked == [(32, 1), (64, 1), (64, 1)]
+
+
 @pytest.mark.parametrize(
     ("failure", "why"),
     [

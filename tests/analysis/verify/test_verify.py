@@ -14,7 +14,7 @@ from scipy.interpolate import CubicHermiteSpline
 from scipy.linalg import solve_continuous_are
 
 from rtcd_jax.analysis.verify.run import verify_run
-from rtcd_jax.analysis.verify.verification import verify_funnel
+from rtcd_jax.analysis.verify.verification import Trial, Verification
 from rtcd_jax.elite.closed_loop import ClosedLoop, simulate
 from rtcd_jax.elite.elite import Elite
 from rtcd_jax.elite.records import write_elite
@@ -103,8 +103,15 @@ def _outcomes(elite: Elite, knots, states):
     ]
 
 
+def verified(elite: Elite, states: int = 60, seed: int = 0) -> Verification:
+    """All chunks of a trial, one after the other."""
+    trial = Trial(elite, states, seed)
+    chunks = [(simulator, chunk) for simulator in trial.names for chunk in range(trial.chunks)]
+    return trial.verification({each: trial.outcome(*each) for each in chunks})
+
+
 def test_a_small_funnel_about_the_upright_keeps_its_promise():
-    result = verify_funnel(_held(HELD), states=60)
+    result = verified(_held(HELD))
     assert tuple(result.outcomes) == SIMULATORS
     for simulator in SIMULATORS:
         assert result.failures(simulator) == 0
@@ -113,7 +120,7 @@ def test_a_small_funnel_about_the_upright_keeps_its_promise():
 
 
 def test_a_funnel_a_hundred_times_too_large_is_refuted_by_both_simulators():
-    result = verify_funnel(_held(100 * HELD), states=60)
+    result = verified(_held(100 * HELD))
     for simulator in SIMULATORS:
         outcome = result.outcomes[simulator]
         assert result.interval(simulator)[0] > result.epsilon
@@ -125,7 +132,7 @@ def test_a_funnel_a_hundred_times_too_large_is_refuted_by_both_simulators():
 
 @pytest.mark.parametrize("level", [HELD, 10 * HELD, 100 * HELD])
 def test_the_simulators_agree_on_every_state(level):
-    result = verify_funnel(_held(level), states=120, seed=1)
+    result = verified(_held(level), states=120, seed=1)
     mujoco_saw, closed_form_saw = result.outcomes.values()
     for kind in ("left_funnel", "left_limits", "missed_goal"):
         np.testing.assert_array_equal(getattr(mujoco_saw, kind), getattr(closed_form_saw, kind))
@@ -225,7 +232,7 @@ def test_limits_are_watched_between_the_knots(speed_limit):
 
 def test_a_promise_is_refuted_only_where_the_interval_lies_above_it():
     """The same failures refute a small epsilon and not one above their lower bound."""
-    result = verify_funnel(_held(10 * HELD), states=60)
+    result = verified(_held(10 * HELD))
     lower, _ = result.interval("closed form")
     assert lower > 0
     assert not dataclasses.replace(result, epsilon=1.001 * lower).refutes("closed form")
@@ -280,16 +287,15 @@ def test_verify_run_reports_an_initial_candidate_without_a_funnel(tmp_path):
 
 def test_chunks_do_not_change_a_verdict(monkeypatch):
     elite = _held(10 * HELD)
-    whole = verify_funnel(elite, states=50).outcomes["closed form"]
+    whole = verified(elite, states=50).outcomes["closed form"]
     monkeypatch.setattr("rtcd_jax.analysis.verify.verification.CHUNK", 7)
-    parts = verify_funnel(elite, states=50).outcomes["closed form"]
+    parts = verified(elite, states=50).outcomes["closed form"]
     assert whole.failed.any()
     for kind in ("left_funnel", "left_limits", "missed_goal"):
         np.testing.assert_array_equal(getattr(parts, kind), getattr(whole, kind))
 
 
 def test_a_stopped_verification_goes_on_and_ends_with_the_same_files(tmp_path, monkeypatch):
-    """On any number of processes; chunks of a funnel that has changed since are not taken."""
     monkeypatch.setattr("rtcd_jax.analysis.verify.verification.CHUNK", 20)
     for name in ("whole", "stopped"):
         _store(tmp_path / name / "elites", "000", _held(10 * HELD))
@@ -307,12 +313,19 @@ def test_a_stopped_verification_goes_on_and_ends_with_the_same_files(tmp_path, m
         whole, stopped = (tmp_path / run / "verification" / name for run in ("whole", "stopped"))
         assert whole.read_bytes() == stopped.read_bytes()
     assert sorted(path.name for path in (folder / "verification").iterdir()) == ["000.json", "initial.json"]
+
+
+def test_chunks_of_a_funnel_that_has_changed_are_simulated_again(tmp_path, monkeypatch):
+    monkeypatch.setattr("rtcd_jax.analysis.verify.verification.CHUNK", 20)
+    _store(tmp_path / "elites", "000", _held(10 * HELD))
+    _store(tmp_path, "initial", _held(HELD))
     with pytest.raises(Stopped):
-        verify_run(folder, 60, 3, 1, Screen(stop="5/12 chunks").console)
-    _store(folder, "initial", _held(0.9 * HELD))
+        verify_run(tmp_path, 60, 3, 1, Screen(stop="8/12 chunks").console)
+    _store(tmp_path, "initial", _held(0.9 * HELD))
     screen = Screen()
-    verify_run(folder, 60, 3, 1, screen.console)
-    assert "6/12 chunks" in screen.text
+    verify_run(tmp_path, 60, 3, 1, screen.console)
+    assert "7/12 chunks" in screen.text  # the six of 000 stay
+    assert "6/12 chunks" not in screen.text
 
 
 def test_the_number_of_processes_changes_nothing(tmp_path):
@@ -326,7 +339,7 @@ def test_the_number_of_processes_changes_nothing(tmp_path):
 
 
 def test_the_same_seed_gives_the_same_states():
-    first, again, other = (verify_funnel(_held(HELD), states=6, seed=seed).states for seed in (1, 1, 2))
+    first, again, other = (verified(_held(HELD), states=6, seed=seed).states for seed in (1, 1, 2))
     np.testing.assert_array_equal(first, again)
     assert not np.any(first == other)
 
@@ -344,12 +357,12 @@ def test_verify_run_refuses_what_is_no_finished_run(tmp_path):
 
 def test_too_few_states_for_the_knots_are_refused():
     with pytest.raises(UserError, match="states = 5: must be at least 6, one for each knot's ellipsoid"):
-        verify_funnel(_held(HELD), states=5)
+        verified(_held(HELD), states=5)
 
 
 def test_a_goal_that_is_not_held_is_refused():
     with pytest.raises(UserError, match="K_goal does not hold the goal: a mode of its loop grows at"):
-        verify_funnel(dataclasses.replace(_held(HELD), K_goal=np.zeros((1, 2))), states=6)
+        verified(dataclasses.replace(_held(HELD), K_goal=np.zeros((1, 2))), states=6)
 
 
 @pytest.mark.parametrize(
