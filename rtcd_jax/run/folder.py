@@ -17,8 +17,9 @@ import os
 import socket
 import time
 from collections.abc import Iterable, Iterator
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Self, TypeVar, cast, final
+from typing import TYPE_CHECKING, Any, NamedTuple, Self, TypeVar, cast, final
 
 import numpy as np
 
@@ -120,32 +121,35 @@ class RunFolder:
     def restore(self, state: State) -> State:
         """The latest saved state, or `state` if there is none; later lines of generations.jsonl are cut off.
 
-        Where that state is damaged, or lines up to it are missing, the one before is taken; the later ones are moved
-        into `state.damaged`. `state` is that of a search that has not begun: its arrays say the shapes. Raises
-        UserError, and moves nothing, if no saved state fits them and the lines.
+        Where that state is damaged, or lines before it are lost, it is the latest whole one with all its lines, where
+        there is none, the latest whole one without them; later ones are moved into `state.damaged`. `state` is that of
+        a search that has not begun: its arrays say the shapes. Raises UserError, and moves nothing, if no saved state
+        fits them.
         """
         saved = sorted(self._checkpointer.checkpoints, key=lambda each: each.step, reverse=True)
-        lines = int(self._cluster.agreed(np.asarray(len(_lines(self._lines_path)) if self._cluster.first else 0)))
-        shapes, errors = self._cluster.replicated(state), []
-        for index, checkpoint in enumerate(saved):
+        steps = [checkpoint.step for checkpoint in saved]
+        held = self._cluster.on_first(lambda: {line.index for line in _lines(self._lines_path)}) or set()
+        missing = self._cluster.agreed(np.array([len(set(range(step)) - held) for step in steps], int))
+        shapes = self._cluster.replicated(state)
+        lost = [f"{self._lines_path} lacks {missing[k]} of the {step} lines before {saved[k].path}"
+                for k, step in enumerate(steps)]  # fmt: skip
+        refused: dict[int, str] = {}
+        for k in sorted(range(len(saved)), key=lambda k: missing[k] > 0):
             try:
-                if lines < checkpoint.step:
-                    raise UserError(
-                        f"{self._lines_path} has {lines} complete lines, but {self._state_path} is of generation "
-                        f"{checkpoint.step}: the folder was changed by hand; choose another one"
-                    )
-                loaded = _load(self._checkpointer, checkpoint, shapes)
+                loaded = _load(self._checkpointer, saved[k], shapes)
             except UserError as error:
-                errors.append(error)
+                refused[k] = str(error)
                 continue
-            if index:
-                self._cluster.on_first(lambda damaged=saved[:index]: self._set_aside(damaged))
+            reasons = ([refused.get(0, lost[0])] if k else []) + ([lost[k]] if missing[k] else [])
+            if reasons:
+                self.notes.append(f"{'; '.join(reasons)}; going on with the state of generation {steps[k]}")
+            if k:
+                self._cluster.on_first(partial(self._set_aside, saved[:k]))
                 self._checkpointer.reload()
-                self.notes.append(f"{errors[0]}; going on with the state of generation {checkpoint.step}")
-            self._cluster.on_first(lambda step=checkpoint.step: self._cut(step))
+            self._cluster.on_first(partial(self._cut, steps[k]))
             return loaded
-        if errors:
-            raise errors[0]
+        if saved:
+            raise UserError(refused[0])
         self._cluster.on_first(lambda: self._cut(0))
         return state
 
@@ -215,23 +219,37 @@ class RunFolder:
                 (folder / f"{name}.npz").unlink(missing_ok=True)
 
     def _cut(self, generations: int) -> None:
-        with writing(self._lines_path):
-            os.truncate(self._lines_path, sum(_lines(self._lines_path)[:generations]))
+        """Leaves the complete lines of the first `generations` alone."""
+        kept = [line for line in _lines(self._lines_path) if line.index < generations]
+        end = sum(line.length for line in kept)
+        if not kept or end == kept[-1].start + kept[-1].length:  # nothing else between them
+            with writing(self._lines_path):
+                os.truncate(self._lines_path, end)
+            return
+        with reading(self._lines_path, _FORGET):
+            content = self._lines_path.read_bytes()
+        replace(self._lines_path, b"".join(content[line.start : line.start + line.length] for line in kept))
 
 
-def _lines(path: Path) -> list[int]:
-    """Lengths of the file's lines before the first that is torn or damaged."""
-    whole = []
+class _Line(NamedTuple):
+    """Of generations.jsonl: the generation, and the bytes that it takes."""
+
+    index: int
+    start: int
+    length: int
+
+
+def _lines(path: Path) -> list[_Line]:
+    """The file's complete lines; torn and damaged ones are left out."""
+    lines, start = [], 0
     with reading(path, _FORGET), path.open("rb") as file:
         for line in file:
-            try:
-                json.loads(line)
-            except (ValueError, RecursionError):
-                break
-            if not line.endswith(b"\n"):
-                break
-            whole.append(len(line))
-    return whole
+            with contextlib.suppress(ValueError, RecursionError):
+                record = json.loads(line)
+                if isinstance(record, dict) and type(record.get("index")) is int and line.endswith(b"\n"):
+                    lines.append(_Line(record["index"], start, len(line)))
+            start += len(line)
+    return lines
 
 
 @contextlib.contextmanager

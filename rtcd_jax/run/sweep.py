@@ -15,6 +15,7 @@ import copy
 import csv
 import io
 import itertools
+import json
 import math
 import re
 from collections.abc import Iterator, Mapping, Sequence
@@ -31,6 +32,7 @@ from rtcd_jax.volume import VOLUMES
 TABLE = "table.csv"
 WAYS = ("product", "zip")
 MOST_CASES = 10_000
+_RESTORE = "restore it, or make the run again"
 
 
 @final
@@ -171,14 +173,17 @@ def _row(case: Case) -> dict[str, Any]:
 
 
 def _generations(folder: Path) -> int:
-    lines = folder / "generations.jsonl"
-    return lines.read_bytes().count(b"\n") if lines.is_file() else 0
+    """How many are done, by the last complete line: earlier ones may be lost."""
+    path = folder / "generations.jsonl"
+    lines = path.read_bytes().splitlines(keepends=True) if path.is_file() else []
+    complete = [line for line in lines[-2:] if line.endswith(b"\n")]
+    with reading(path, _RESTORE):
+        return int(json.loads(complete[-1])["index"]) + 1 if complete else 0
 
 
 def _volumes(folder: Path, name: str) -> dict[str, float]:
     from rtcd_jax.elite.records import elite_folder
 
     record = elite_folder(folder, name) / f"{name}.json"
-    advice = "restore it, or make the run again"
-    with reading(record, advice):
-        return read_json(record, advice)["volumes"] if record.is_file() else {}
+    with reading(record, _RESTORE):
+        return read_json(record, _RESTORE)["volumes"] if record.is_file() else {}

@@ -329,17 +329,6 @@ def test_a_damaged_configuration_is_named(tmp_path):
     assert "config.yaml: no valid YAML" in refused(tmp_path / "run")
 
 
-def test_lines_that_no_state_fits_are_refused(tmp_path):
-    config, plan = at_generations(tmp_path / "run", 3, 6)
-    lines = (tmp_path / "run" / "generations.jsonl").read_bytes().splitlines(keepends=True)
-    (tmp_path / "run" / "generations.jsonl").write_bytes(b"".join(lines[:2]))
-    with (
-        RunFolder.open(tmp_path / "run", config) as folder,
-        pytest.raises(UserError, match=r"has 2 complete lines, but .* is of generation 6: the folder was changed"),
-    ):
-        folder.restore(begin(plan))
-
-
 @pytest.mark.parametrize("like", [{"a": jnp.zeros(3)}, {"b": jnp.zeros(2)}, {"a": jnp.zeros(2), "b": jnp.zeros(1)}])
 def test_a_state_of_other_shapes_is_refused(tmp_path, like):
     with RunFolder.open(tmp_path / "run", experiment()) as folder:
@@ -410,14 +399,70 @@ def test_where_every_state_is_damaged_nothing_is_moved(tmp_path):
     assert not (tmp_path / "run" / "state.damaged").exists()
 
 
-@pytest.mark.parametrize("cut", [4, 5])
-def test_lines_that_are_lost_take_the_state_before_them(tmp_path, cut):
+def keep_lines(run, kept, damage=b""):
+    lines = (run / "generations.jsonl").read_bytes().splitlines(keepends=True)
+    (run / "generations.jsonl").write_bytes(damage.join(lines[k] for k in kept))
+
+
+def held_lines(run):
+    return [line["index"] for line in records.read_generations(run)]
+
+
+@pytest.mark.parametrize("kept", [range(4), range(5), [0, 1, 2, 4, 5]])
+def test_lines_that_are_lost_take_the_state_before_them(tmp_path, kept):
     config, plan = at_generations(tmp_path / "run", 3, 6)
-    lines = (tmp_path / "run" / "generations.jsonl").read_bytes().splitlines(keepends=True)
-    (tmp_path / "run" / "generations.jsonl").write_bytes(b"".join([*lines[:cut], b"{torn\n", *lines[cut:]]))
+    keep_lines(tmp_path / "run", kept, b"{torn\n")
     with RunFolder.open(tmp_path / "run", config) as folder:
         assert int(folder.restore(begin(plan)).generation) == 3
-        assert f"has {cut} complete lines" in folder.notes[0]
+        (note,) = folder.notes
+    assert f"generations.jsonl lacks {6 - len(kept)} of the 6 lines before" in note
+    assert note.endswith("going on with the state of generation 3")
+    drive(tmp_path / "run", config)
+    drive(tmp_path / "whole", config)
+    assert results(tmp_path / "run") == results(tmp_path / "whole")
+
+
+@pytest.mark.parametrize("damage", [b"{torn\n", b"\n", b"[]\n", b'{"index": true}\n', b"[" * 100_000 + b"\n"])
+def test_damaged_lines_among_whole_ones_are_taken_out(tmp_path, damage):
+    config, plan = at_generations(tmp_path / "run", 3, 6)
+    keep_lines(tmp_path / "run", range(6), damage)
+    with RunFolder.open(tmp_path / "run", config) as folder:
+        assert int(folder.restore(begin(plan)).generation) == 6
+        assert not folder.notes
+    assert held_lines(tmp_path / "run") == list(range(6))
+
+
+@pytest.mark.parametrize("kept", [None, [], [1, 4, 5]])
+def test_without_a_state_that_has_its_lines_the_latest_goes_on_and_says_so(tmp_path, kept):
+    config, plan = at_generations(tmp_path / "run", 3, 6)
+    if kept is None:
+        (tmp_path / "run" / "generations.jsonl").unlink()
+    else:
+        keep_lines(tmp_path / "run", kept)
+    held = [*(kept or [])]
+    for done in (6, 9):  # at every later start, too
+        with RunFolder.open(tmp_path / "run", config) as folder:
+            assert int(folder.restore(begin(plan)).generation) == done
+            (note,) = folder.notes
+        assert f"generations.jsonl lacks {6 - len(held)} of the {done} lines before" in note
+        assert note.endswith(f"going on with the state of generation {done}")
+        drive(tmp_path / "run", config)
+        assert held_lines(tmp_path / "run") == [*held, 6, 7, 8]
+    drive(tmp_path / "whole", config)
+    lost = "generations.jsonl"
+    whole = results(tmp_path / "whole") | {lost: (tmp_path / "run" / lost).read_bytes()}
+    assert results(tmp_path / "run") == whole
+
+
+def test_without_lines_a_damaged_newest_state_leaves_the_one_before(tmp_path):
+    config, plan = at_generations(tmp_path / "run", 3, 6)
+    damaged(tmp_path / "run" / "state" / "6")
+    (tmp_path / "run" / "generations.jsonl").unlink()
+    with RunFolder.open(tmp_path / "run", config) as folder:
+        assert int(folder.restore(begin(plan)).generation) == 3
+        (note,) = folder.notes
+    assert "state/6 is no state of this search" in note
+    assert "lacks 3 of the 3 lines before" in note
 
 
 @pytest.mark.parametrize("content", [None, b"", b"[" * 100_000, b'{"format": '])
@@ -443,7 +488,7 @@ def test_another_configuration_is_refused_even_without_the_stored_one(tmp_path):
         assert (tmp_path / "run" / "config.yaml").is_file()
 
 
-@pytest.mark.parametrize("name", ["provenance.json", "format.json", "config.yaml", "generations.jsonl"])
+@pytest.mark.parametrize("name", ["provenance.json", "format.json", "config.yaml"])
 @pytest.mark.parametrize("content", [b"[" * 100_000, b'{"a": ' * 100_000])
 def test_deep_nesting_is_one_error_that_names_the_file(tmp_path, name, content):
     config, plan = at_generations(tmp_path / "run", 3)

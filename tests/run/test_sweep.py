@@ -88,7 +88,7 @@ def test_the_table_has_what_is_known(tmp_path):
     volumes = {"sum": 2.0, "integral": 1.0, "inlet": 0.5, "geometric_mean": 0.25}
     (folder / "initial.json").write_text(json.dumps({"volumes": volumes}))
     (folder / "elites" / "000.json").write_text(json.dumps({"volumes": volumes | {"sum": 7.0}}))
-    (folder / "generations.jsonl").write_text("{}\n{}\n{}\n")
+    (folder / "generations.jsonl").write_text('{"index": 0}\n{"index": 2}\n{"ind')
     lines = [*show(cases).splitlines(), str(store(cases, tmp_path / "runs"))]
     assert [line.split() for line in lines[-4:-1]][1:] == [["0", "0", "0/60"], ["1", "1", "3/60", "2", "7", "3.5"]]
     with (tmp_path / "runs" / "table.csv").open() as file:

@@ -98,11 +98,12 @@ def _header(runs: Sequence[Run]) -> str:
     about = f"{first.plant.name}, {first.trajectory.knots} knots"
     if len(runs) == 1:
         search = first.search
-        if runs[0].generations:
+        if runs[0].audited:
+            about += "; an external funnel, audited"
+        else:
             about += f"; {search.mode} search for the largest {words(search.objective)}, "
             about += f"{search.generations} generations of {search.population}"
-        else:
-            about += "; an external funnel, audited"
+            about += "" if runs[0].generations else ", whose lines are lost"
         cards = "".join(_card(*card) for card in _headlines(runs[0]))
         candidate = f'<p class="candidate">{_candidate(runs[0])}</p>'
     else:

@@ -99,8 +99,8 @@ class Certificate:
 class Run:
     """A run folder. `initial` is None where the initial candidate has no funnel, and `absence` says why.
 
-    `figures` is the folder that they are drawn into; `labels` are those of the initial and of the best funnel, and
-    `color` is the best one's.
+    `figures` is the folder that they are drawn into; an `audited` funnel is external; `labels` are those of the initial
+    and of the best funnel, and `color` is the best one's.
     """
 
     path: Path
@@ -116,6 +116,7 @@ class Run:
     verification: Mapping[str, Mapping[str, Any]]
     experiments: Sequence[Experiment]
     provenance: Mapping[str, Any]
+    audited: bool = False
     labels: tuple[str, str] = ("initial", "best")
     color: str = VERMILION
 
@@ -159,6 +160,7 @@ def read_run(path: Path, console: Console | None = None) -> Run:
         },
         experiments=tuple(_experiments(path / "disturbance")),
         provenance=_shaped(path / "provenance.json", _PROVENANCE),
+        audited=(path / AUDIT).is_file(),
     )
 
 
@@ -171,15 +173,8 @@ def _require_shown(name: str, elite: Elite) -> None:
 
 
 def read_search(path: Path) -> list[dict[str, Any]]:
-    """The generations of a run, none of an audited funnel, which nobody searched.
-
-    Raises UserError if others have none.
-    """
+    """The generations of a run; none of an audited funnel, which nobody searched, and where their lines are lost."""
     generations = read_generations(path) if (path / "generations.jsonl").is_file() else []
-    if not generations and (path / AUDIT).is_file():
-        return []
-    if not generations:
-        raise UserError(f"{path} has no generations yet: begin the run first")
     for number, record in enumerate(generations, 1):
         missing = [name for name in _OF_A_GENERATION if name not in record]
         if missing:

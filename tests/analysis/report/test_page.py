@@ -190,3 +190,15 @@ def test_a_page_that_cannot_be_written_is_refused(tmp_path, figures):
     (run / "figures").write_text("in the way")
     with pytest.raises(UserError, match=r"cannot write .*figures"):
         report([run])
+
+
+def test_a_run_that_has_lost_its_generations_has_a_page_without_them(tmp_path):
+    config = experiment()
+    lost = run_folder(tmp_path / "lost", config, candidate(config), candidate(config, 1), generations=[])
+    page = render([read_run(lost)])
+    assert "whose lines are lost" in page
+    assert "external funnel" not in page
+    assert "<h2>Search</h2>" not in page
+    whole = finished(tmp_path / "whole")
+    assert "<h2>Search</h2>" in render([read_run(whole)])
+    assert "<h2>Compared</h2>" in render(compared([read_run(lost), read_run(whole)]))

@@ -65,8 +65,6 @@ def test_what_is_no_finished_run_is_refused(tmp_path):
         read_run(tmp_path)
     with pytest.raises(UserError, match="has no elites yet: finish the run first"):
         read_run(run_folder(tmp_path / "empty", config))
-    with pytest.raises(UserError, match="has no generations yet"):
-        read_run(run_folder(tmp_path / "silent", config, best=candidate(config), generations=[]))
     failed = run_folder(tmp_path / "failed", config, best=candidate(config, status="FUNNEL_EMPTY"))
     with pytest.raises(UserError, match=r"000 has no funnel \(FUNNEL_EMPTY\)"):
         read_run(failed)
