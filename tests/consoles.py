@@ -1,4 +1,4 @@
-"""A real console on a terminal of memory: what a verb says there, and a stop as soon as it says something."""
+"""A real console in memory, on a terminal or as a file: what a verb says there, and a stop once it says something."""
 
 import io
 
@@ -9,6 +9,18 @@ from rtcd_jax.system.console import Console
 
 class Stopped(BaseException):
     """Ends a verb as a kill would: nothing catches it."""
+
+
+class Output(io.StringIO):
+    """What a verb printed into a file."""
+
+    @property
+    def console(self) -> Console:
+        return Console(self)
+
+    @property
+    def lines(self) -> list[str]:
+        return self.getvalue().splitlines()
 
 
 class Screen(io.StringIO):

@@ -9,7 +9,7 @@ import yaml
 
 from rtcd_jax.config import load as configuration
 from rtcd_jax.evaluation import make_evaluate
-from rtcd_jax.genome import _to_unit
+from rtcd_jax.genome import encode
 from rtcd_jax.problem import Problem, make_problem
 from rtcd_jax.types import Evaluation
 
@@ -38,8 +38,7 @@ def problem() -> Problem:
 @cache
 def genomes() -> jax.Array:
     """Those of `CANDIDATES` [5 d]."""
-    variables = problem().variables
-    return jnp.asarray([[_to_unit(variables[i], value) for i, value in enumerate(row)] for row in CANDIDATES])
+    return jnp.asarray([encode(problem(), row) for row in CANDIDATES.tolist()])
 
 
 @cache

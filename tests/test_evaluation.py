@@ -21,7 +21,7 @@ CLOSE = 1e-7
 """Programs of other sizes sum in another order, which the trajectory's stopping and the rollouts carry on."""
 
 
-def _assert_close(left, right, rtol=CLOSE):
+def assert_close(left, right, rtol=CLOSE):
     for a, b in zip(jax.tree.leaves(left), jax.tree.leaves(right), strict=True):
         if jnp.issubdtype(a.dtype, jnp.floating):
             np.testing.assert_allclose(a, b, rtol=rtol, atol=rtol)
@@ -40,8 +40,8 @@ def test_the_parts_of_an_evaluation_belong_together():
     evaluation = pipeline.evaluated()
     np.testing.assert_array_equal(evaluation.genome, pipeline.genomes())
     decoded = jax.jit(jax.vmap(lambda genome: decode(pipeline.problem(), genome)))(pipeline.genomes())
-    _assert_close(evaluation.candidate, decoded, rtol=1e-14)
-    _assert_close(evaluation.volumes, jax.jit(jax.vmap(funnel_volume))(evaluation.funnel), rtol=1e-13)
+    assert_close(evaluation.candidate, decoded, rtol=1e-14)
+    assert_close(evaluation.volumes, jax.jit(jax.vmap(funnel_volume))(evaluation.funnel), rtol=1e-13)
     np.testing.assert_array_equal(evaluation.status, evaluation.funnel.status)
     statuses = [Status.OK] * 5
     statuses[pipeline.HARD] = Status.FUNNEL_EMPTY
@@ -76,7 +76,7 @@ def test_a_population_is_its_candidates_one_by_one():
     alone = jax.jit(make_evaluate(pipeline.problem()))
     for k in (pipeline.INITIAL, pipeline.RTCD, pipeline.HARD):
         row = jax.tree.map(lambda leaf, k=k: leaf[k : k + 1], pipeline.evaluated())
-        _assert_close(alone(pipeline.genomes()[k : k + 1], pipeline.GENERATION), row)
+        assert_close(alone(pipeline.genomes()[k : k + 1], pipeline.GENERATION), row)
 
 
 @pytest.mark.slow
@@ -84,7 +84,7 @@ def test_a_resampled_funnel_is_about_the_same_policy():
     """With the same budget and key it is the same funnel, with another key other levels but where a box ends them."""
     row = jax.tree.map(lambda leaf: leaf[pipeline.RTC], pipeline.evaluated())
     again = jax.jit(partial(resample, pipeline.problem(), search_budget(pipeline.problem())))
-    _assert_close(again(row, pipeline.GENERATION), row)
+    assert_close(again(row, pipeline.GENERATION), row)
     other = again(row, jax.random.key(1))
     assert same(other.funnel.policy, row.funnel.policy)
     policy = row.funnel.policy
@@ -99,4 +99,4 @@ def test_a_resampled_funnel_is_about_the_same_policy():
 @pytest.mark.parametrize("chunk", [1, 2])
 def test_the_chunk_does_not_matter(chunk):
     """It bounds the memory: also one that does not divide the population."""
-    _assert_close(_rechunked(chunk)(pipeline.genomes(), pipeline.GENERATION), pipeline.evaluated())
+    assert_close(_rechunked(chunk)(pipeline.genomes(), pipeline.GENERATION), pipeline.evaluated())

@@ -48,7 +48,7 @@ def _section(name: str, field: FieldInfo) -> Iterator[str]:
     elif get_origin(kind) is dict:
         for plant, model in PLANTS.items():
             yield f"### {plant}\n"
-            yield _table([(f"{name}.{key}", told, "required", "", "a variable") for key, told in model.design.items()])
+            yield _table([(f"{name}.{key}", unit, "required", "", "a variable") for key, unit in model.design.items()])
     else:
         yield _table(_rows(f"{name}.", _model(kind)))
 

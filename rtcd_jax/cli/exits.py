@@ -25,7 +25,7 @@ GRACE = 1.0
 _LONGEST = 400
 STOPPED = "stopped; run the same command to go on"
 _SHOW_CURSOR = b"\x1b[?25h"
-_asked, _told = threading.Event(), threading.Event()
+_interrupted, _explained = threading.Event(), threading.Event()
 
 
 class Exit(enum.IntEnum):
@@ -51,7 +51,7 @@ class Exit(enum.IntEnum):
 
 def explain(error: BaseException, debug: bool = False) -> Exit:
     """Says in one line on stderr what ended a command, with the traceback before it if asked to; the exit code."""
-    if _asked.is_set():  # whatever a library has made of it
+    if _interrupted.is_set():  # whatever a library has made of it
         error = KeyboardInterrupt()
     if debug and not isinstance(error, BrokenPipeError):
         say("".join(traceback.format_exception(error)).rstrip())
@@ -69,7 +69,7 @@ def explain(error: BaseException, debug: bool = False) -> Exit:
             say("rtcd: a worker process was ended from outside, for want of memory perhaps: try fewer")
             return Exit.LOST_PROCESS
         case KeyboardInterrupt():
-            _told.set()
+            _explained.set()
             say(STOPPED)
             return Exit.INTERRUPTED
     if _about_devices(error):
@@ -111,7 +111,7 @@ def as_process(command: Callable[[], int]) -> int:
     try:
         code = command()
         sys.stdout.flush()
-        if _asked.is_set() and not _told.is_set():  # and the exception was lost
+        if _interrupted.is_set() and not _explained.is_set():  # and the exception was lost
             code = explain(KeyboardInterrupt())
     except BrokenPipeError:
         code = Exit.CUT_OFF
@@ -152,14 +152,14 @@ def _watch_interrupts() -> None:
 
 
 def _interrupt(*_: object) -> NoReturn:
-    _asked.set()
+    _interrupted.set()
     raise KeyboardInterrupt
 
 
 def _end_after_interrupt(pipe: int) -> NoReturn:
     while signal.SIGINT not in os.read(pipe, 64):
         pass
-    if not _told.wait(GRACE):
+    if not _explained.wait(GRACE):
         # Past Python's buffers, whose locks the main thread may hold.
         with contextlib.suppress(OSError):
             os.write(2, f"{STOPPED}\n".encode())

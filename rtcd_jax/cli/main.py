@@ -122,27 +122,29 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Runs one verb and returns the exit code.
 
     Without `arguments` it is all that this process does, and takes the process' own: it may leave at once, heeds
-    interrupts, and ends quietly where nobody reads.
+    interrupts, and ends quietly where its output is closed.
     """
     if arguments is None:
         return as_process(lambda: main(sys.argv[1:]))
     words = [word for word in arguments if word != DEBUG]
     debug = len(words) < len(arguments)
     try:
-        return _command(words or ["--help"], debug)
+        return _command(words or ["--help"])
     except SystemExit as stop:  # tyro's: help, or an option that is not there
         return int(stop.code or 0)
     except (Exception, KeyboardInterrupt) as error:
         return explain(error, debug)
 
 
-def _command(words: Sequence[str], debug: bool) -> int:
+def _command(words: Sequence[str]) -> int:
     verb, *rest = words
     if verb in ("-h", "--help"):
         print(_usage())
         return Exit.OK
     if verb == "--version":
-        print(_version())
+        from importlib.metadata import version
+
+        print(f"rtcd {version('rtcd-jax')}")
         return Exit.OK
     if verb not in VERBS:
         raise UserError(f"unknown command {verb!r}; {closest(verb, tuple(VERBS))}")
@@ -165,12 +167,6 @@ def _usage() -> str:
             *(f"  {code:3d}  {code.meaning}" for code in Exit),
         ]
     )
-
-
-def _version() -> str:
-    from importlib.metadata import version
-
-    return f"rtcd {version('rtcd-jax')}"
 
 
 if __name__ == "__main__":

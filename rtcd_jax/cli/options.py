@@ -1,4 +1,4 @@
-"""A verb's options: a pydantic model that tyro reads from the command line, with all that is wrong told at once."""
+"""A verb's options: a pydantic model that tyro reads from the command line; one error names all that is wrong."""
 
 import contextlib
 import io

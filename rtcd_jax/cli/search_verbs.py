@@ -125,7 +125,7 @@ def optimize(options: OptimizeOptions, console: Console) -> Exit:
 def _finish_page(run: Path, changed: bool, console: Console) -> None:
     """Makes a finished run's page and figures, unless they are there and still true.
 
-    The run is whole without them: what goes wrong here is told, and ends nothing.
+    The run is whole without them: what goes wrong here is a message, and ends nothing.
     """
     if not changed and (run / "report.html").is_file():
         return
@@ -213,7 +213,8 @@ def counts(text: str) -> tuple[int, ...]:
 class ScaleOptions(Options):
     """Measure whole generations against the population and the devices; writes a table and figures.
 
-    Every point runs in a process of its own, on a CPU with a core for each device; what is measured already is kept.
+    Every point runs in a process of its own, on a CPU with a core for each device. What is measured already is not
+    measured again.
 
     Example: rtcd scale configs/pendulum_rtcd.yaml --populations 64,256,1024 --devices 1,2
     """

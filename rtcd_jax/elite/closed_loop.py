@@ -119,14 +119,14 @@ def simulate(
     """
     loop, x = ClosedLoop.of(elite, f), states.copy()
     left_funnel = np.zeros(len(x), bool)
-    left_limits = _outside(elite, x)
+    left_limits = outside_limits(elite, x)
 
     def advance(march: March, moving: np.ndarray, policy: Policy, start: float, end: float) -> None:
         if not moving.size:
             return
         outside = np.zeros(moving.size, bool)
         for now in march(policy, start, end, x[moving]):
-            outside |= _outside(elite, now)
+            outside |= outside_limits(elite, now)
             x[moving] = now
         left_limits[moving] |= outside
 
@@ -213,7 +213,7 @@ def dormand_prince(f: Dynamics, longest_step: float, relative: float, absolute: 
     return march
 
 
-def _outside(elite: Elite, x: Float[np.ndarray, "states n"]) -> Bool[np.ndarray, " states"]:
+def outside_limits(elite: Elite, x: Float[np.ndarray, "states n"]) -> Bool[np.ndarray, " states"]:
     """Beyond the limits, or no longer finite."""
     return ~np.all(np.abs(x) <= np.minimum(elite.state_limits, np.finfo(float).max), axis=1)
 

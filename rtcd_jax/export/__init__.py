@@ -4,13 +4,13 @@ Tables, the controller with its funnel monitor in numpy and in C99, test vectors
 mean the closed loop that the run has sampled: x*(t) cubic Hermite, K linear, after t_N the goal's LQR.
 """
 
+import contextlib
 import hashlib
 import io
 import json
 import os
 import re
-import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -22,9 +22,9 @@ from rtcd_jax.certificate.standing import certificate_path
 from rtcd_jax.elite.records import elite_name
 from rtcd_jax.export import robot, source, tables
 from rtcd_jax.export.bundle import Bundle, read_bundle
-from rtcd_jax.system.console import Console, Progress
+from rtcd_jax.system.console import Console, each_second
 from rtcd_jax.system.errors import UserError, printable
-from rtcd_jax.system.files import is_temporary, plain, replace, replace_json, writing
+from rtcd_jax.system.files import plain, replace, replace_json, require_own_folder, writing
 
 FORMAT = "rtcd_jax export"
 VERSION = 1
@@ -41,7 +41,7 @@ def export_run(folder: Path, elite: int | str, target: Path, console: Console, l
         UserError: no run folder, no such elite, one without a funnel, or a target that holds something else.
     """
     former = _former(target)
-    bundle = read_bundle(folder, elite_name(elite), label, _telling(console))
+    bundle = read_bundle(folder, elite_name(elite), label, each_second(console))
     contents = _files(folder, bundle)
     _require_ours(target, former, contents)
     digests = {file: _digest(content) for file, content in contents.items()}
@@ -54,23 +54,10 @@ def export_run(folder: Path, elite: int | str, target: Path, console: Console, l
     _mark(target, bundle, complete=False, files=stale | digests)
     for file, content in contents.items():
         replace(target / file, content)
-    kept = [file for file, digest in stale.items() if not _remove(target / file, digest)]
+    changed = [file for file, digest in stale.items() if not _remove(target / file, digest)]
     _mark(target, bundle, complete=True, files=digests)
-    for line in _summary(bundle, target, bool(former), kept):
+    for line in _summary(bundle, target, bool(former), changed):
         console.message(line)
-
-
-def _telling(console: Console) -> Callable[[int, int, str], None]:
-    """What says every second how far a long step is."""
-    told = time.monotonic()
-
-    def tell(done: int, of: int, what: str) -> None:
-        nonlocal told
-        if time.monotonic() - told >= 1:
-            told = time.monotonic()
-            console.progress(Progress(done, of, f"{what}  {done}/{of}"))
-
-    return tell
 
 
 def _former(target: Path) -> dict[str, str]:
@@ -79,24 +66,14 @@ def _former(target: Path) -> dict[str, str]:
     Raises:
         UserError: `target` is a file, or a folder with something else in it.
     """
-    if target.exists() and not target.is_dir():
-        raise UserError(f"{target} is a file: an export needs a folder")
-    if not target.is_dir():
-        return {}
-    mark = target / MARK
+    mark, files = target / MARK, None
     if mark.is_file() and not mark.is_symlink():
-        try:
+        with contextlib.suppress(ValueError, KeyError, TypeError, AttributeError, RecursionError, OSError):
             stored = json.loads(mark.read_bytes())
             if stored["format"] == FORMAT:
-                return {name: str(digest) for name, digest in stored["files"].items() if _is_plain(name)}
-        except (ValueError, KeyError, TypeError, AttributeError, RecursionError, OSError):
-            pass
-    foreign = sorted(item.name for item in target.iterdir() if not is_temporary(item))
-    if foreign:
-        raise UserError(
-            f"{target} is not empty and no former export: it has {', '.join(foreign[:5])}; choose another one"
-        )
-    return {}
+                files = {name: str(digest) for name, digest in stored["files"].items() if _is_plain(name)}
+    require_own_folder(target, "an export", files is not None)
+    return files or {}
 
 
 def _is_plain(name: str) -> bool:
@@ -176,21 +153,21 @@ def _robot(bundle: Bundle) -> dict[str, str]:
 def _parameters(bundle: Bundle, described: Mapping[str, Any]) -> str:
     units = described["parameter_units"]
     numbers = {name: {"value": value, "unit": units[name]} for name, value in described["parameters"].items()}
-    kept = {key: described[key] for key in ("plant", "design", "weights", "config_hash")}
-    return yaml.safe_dump(plain({**kept, "parameters": numbers}), sort_keys=False, default_flow_style=None, width=120)
+    origin = {key: described[key] for key in ("plant", "design", "weights", "config_hash")}
+    return yaml.safe_dump(plain({**origin, "parameters": numbers}), sort_keys=False, default_flow_style=None, width=120)
 
 
-def _summary(bundle: Bundle, target: Path, again: bool, kept: Sequence[str]) -> Iterator[str]:
-    verb, found = "replaces the former export" if again else "is", bundle.standing
+def _summary(bundle: Bundle, target: Path, again: bool, changed: Sequence[str]) -> Iterator[str]:
+    verb, standing = "replaces the former export" if again else "is", bundle.standing
     yield f"{bundle.elite.plant}, elite {bundle.name}, {verb} in {target}; its monitor's funnel is {bundle.guarantee}"
     if bundle.proof:
         where = target / "certificate.json"
-        yield f"certificate: proved from {found.start:.6g} s on, in {where}; claim: sha256 {found.claim}"
-    elif found.verdict == "missing":
+        yield f"certificate: proved from {standing.start:.6g} s on, in {where}; claim: sha256 {standing.claim}"
+    elif standing.verdict == "missing":
         yield "certificate: none; `rtcd certify` proves the funnel"
     else:
-        yield f"certificate: {found.verdict}, so it does not go along: {printable(found.reason)}"
+        yield f"certificate: {standing.verdict}, so it does not go along: {printable(standing.reason)}"
     yield f"control rate: {bundle.control_rate.sentence}"
-    if kept:
-        yield f"left where they are, for they were changed since the former export: {', '.join(kept)}"
+    if changed:
+        yield f"left where they are, for they were changed since the former export: {', '.join(changed)}"
     yield f"test it: python {target / f'{bundle.label}_controller.py'}"

@@ -82,12 +82,14 @@ class Bundle:
     def arrays(self) -> dict[str, np.ndarray]:
         """What the controller's npz holds, SI units."""
         elite = self.elite
-        kept = {name: getattr(elite, name) for name in ("time", "x", "u", "K", "S", "rho", "K_goal", "x_goal", "u_max")}
-        more = {"x_rates": self.rates, "S_rates": self.funnel.value_rates}
+        stored = {
+            name: getattr(elite, name) for name in ("time", "x", "u", "K", "S", "rho", "K_goal", "x_goal", "u_max")
+        }
+        rates = {"x_rates": self.rates, "S_rates": self.funnel.value_rates}
         nothing = np.zeros(0), np.zeros((0, 4, *elite.S.shape[1:]))
         begins, axes = (self.proof.begins, self.proof.axes) if self.proof else nothing
         proof = {"proof_begins": begins, "proof_axes": axes}
-        return kept | more | {"state_limits": elite.state_limits, "input_joints": self.joints} | proof
+        return stored | rates | {"state_limits": elite.state_limits, "input_joints": self.joints} | proof
 
     def describe(self) -> dict[str, Any]:
         """What the controller's JSON holds: units, signs, limits, control rate, origin, and what is promised."""
@@ -149,19 +151,19 @@ def read_bundle(
     folder: Path,
     name: str,
     label: str | None = None,
-    tell: Callable[[int, int, str], None] = lambda done, of, what: None,
+    show: Callable[[int, int, str], None] = lambda done, of, what: None,
 ) -> Bundle:
     """The elite `name` ("000", ... or "initial") of a run folder, to be exported as `label`, by default PLANT_NAME.
 
-    `tell(done, of, what)` is told how far a long step is.
+    `show(done, of, what)` is called with the progress of a long step.
 
     Raises:
         UserError: it is not there, cannot be read or has no funnel; a label that is no name in Python and C.
     """
     elite = Elite.read(folder, name)
     label = _label(label or f"{elite.plant}_{name}")
-    found = standing(folder, name, lambda done, of: tell(done, of, "checking the certificate"))
-    proof = ProvedFunnel.read(certificate_path(folder, name)) if found.proved else None
+    certificate = standing(folder, name, lambda done, of: show(done, of, "checking the certificate"))
+    proof = ProvedFunnel.read(certificate_path(folder, name)) if certificate.proved else None
     with jax.enable_x64(True):
         plant, design = plant_class(elite.plant).from_parameters(elite.parameters)
     model = model_of(elite.plant, elite.parameters)
@@ -173,9 +175,9 @@ def read_bundle(
         design=design,
         model=model,
         joints=model.actuator_trnid[:, 0].copy(),
-        standing=found,
+        standing=certificate,
         proof=proof,
-        control_rate=control_rate(elite, proof, lambda done, of: tell(done, of, "trying control rates")),
+        control_rate=control_rate(elite, proof, lambda done, of: show(done, of, "trying control rates")),
     )
 
 

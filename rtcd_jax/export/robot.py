@@ -77,10 +77,10 @@ def _place(root: Xml.Element, attribute: str, name: str) -> tuple[Xml.Element, s
 
 
 def _element(root: Xml.Element, path: str, attribute: str) -> Xml.Element:
-    found = root.find(f".//{path}")
-    if found is None:
+    element = root.find(f".//{path}")
+    if element is None:
         raise ValueError(f"{attribute} is edited, but the MJCF has no {path}")
-    return found
+    return element
 
 
 def _link(model: Any, body: int) -> Xml.Element:

@@ -1,6 +1,6 @@
 """The C controller's numbers as headers, and the text of the folder's README."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from importlib.resources import files
 from string import Template
 from typing import Any
@@ -78,7 +78,11 @@ def _data_header(bundle: Bundle) -> str:
         f"#define RTCD_DURATION {_number(elite.time[-1])}",
         f"#define RTCD_PIECES {proof.begins.size if proof else 0}",
     ]
-    return _header(bundle, "RTCD_CONTROLLER_DATA_H", [*scalars, *_definitions(arrays)])
+    definitions = []
+    for name, array in arrays.items():
+        sizes = "".join(f"[{size}]" for size in array.shape)
+        definitions.append(f"static const double RTCD_{name}{sizes} = {_initializer(array)};")
+    return _header(bundle, "RTCD_CONTROLLER_DATA_H", [*scalars, *definitions])
 
 
 def readme(bundle: Bundle, described: dict[str, Any]) -> str:
@@ -106,20 +110,21 @@ def readme(bundle: Bundle, described: dict[str, Any]) -> str:
 
 def _promise(bundle: Bundle, funnel: Mapping[str, Any]) -> str:
     """What is promised of the funnels, and on what ground."""
-    unit, found = funnel["volume_unit"], bundle.standing
+    unit, standing = funnel["volume_unit"], bundle.standing
     inlet, at_most = f"{funnel['volumes']['inlet']:.4g} {unit}", f"{funnel['epsilon']:.2g}"
     sampled = f"""\
 The funnel of `funnel.csv` is {funnel["rung"]}: in simulation a state drawn uniformly from a knot's ellipsoid (the
 first one has {inlet}) failed to arrive with a probability of at most {at_most}, at confidence
 {funnel["confidence"]:g} jointly for all knots."""
     if bundle.proof is None:
-        return f"{sampled} The monitor evaluates it. Nothing is proved: the certificate is {found.verdict}."
+        return f"{sampled} The monitor evaluates it. Nothing is proved: the certificate is {standing.verdict}."
+    proved = f"{standing.volumes['inlet']:.4g} {unit}"
     return f"""\
-The monitor evaluates the **proved** funnel from {found.start:.6g} s on: every motion of the model that is inside at
+The monitor evaluates the **proved** funnel from {standing.start:.6g} s on: every motion of the model that is inside at
 some time stays inside and comes to the goal, in continuous time, within the limits. Its first ellipsoid has
-{found.volumes["inlet"]:.4g} {unit}. `certificate.json` is the proof, and `rtcd check certificate.json` checks it. The
+{proved}. `certificate.json` is the proof, and `rtcd check certificate.json` checks it. The
 SHA-256 of its claim about this controller stands in the controllers, too:
-`{found.claim}`.
+`{standing.claim}`.
 
 {sampled}"""
 
@@ -128,12 +133,6 @@ def _header(bundle: Bundle, guard: str, lines: list[str]) -> str:
     elite = bundle.elite
     source = f"/* {elite.plant}, elite {bundle.name}, configuration {elite.record['config_hash']}. Generated. */"
     return "\n".join([source, f"#ifndef {guard}", f"#define {guard}", "", *lines, "", "#endif", ""])
-
-
-def _definitions(arrays: dict[str, np.ndarray]) -> Iterator[str]:
-    for name, array in arrays.items():
-        sizes = "".join(f"[{size}]" for size in array.shape)
-        yield f"static const double RTCD_{name}{sizes} = {_initializer(array)};"
 
 
 def _initializer(array: np.ndarray) -> str:

@@ -37,13 +37,13 @@ from rtcd_jax.elite.records import (
 )
 from rtcd_jax.system.errors import UserError
 from rtcd_jax.system.files import (
-    is_temporary,
     make_folder,
     plain,
     read_json,
     reading,
     replace,
     replace_json,
+    require_own_folder,
     sync,
     writing,
 )
@@ -256,7 +256,7 @@ def _lines(path: Path) -> list[_Line]:
 def _prepared(path: Path, config: Config, notes: list[str]) -> Iterator[None]:
     """The folder, made or recognized, locked and clean; `notes` gets what was mended."""
     _mend_mark(path, notes)
-    _require_run_or_nothing(path)
+    require_own_folder(path, "a run", (path / "format.json").is_file(), {_LOCK})
     make_folder(path)
     with _locked(path):
         with writing(path):
@@ -283,16 +283,6 @@ def _mend_mark(path: Path, notes: list[str]) -> None:
     if "config_hash" in read_json(path / "provenance.json", _FORGET):
         replace_json(mark, {"format": FORMAT, "version": VERSION})
         notes.append(f"{mark} was lost or damaged, and is written again")
-
-
-def _require_run_or_nothing(path: Path) -> None:
-    if path.exists() and not path.is_dir():
-        raise UserError(f"{path} is a file: a run needs a folder")
-    if not path.exists() or (path / "format.json").is_file():
-        return
-    foreign = sorted(item.name for item in path.iterdir() if item.name != _LOCK and not is_temporary(item))
-    if foreign:
-        raise UserError(f"{path} is no run folder and not empty: it has {', '.join(foreign[:5])}; choose another one")
 
 
 def _claim(path: Path, config: Config) -> None:

@@ -103,7 +103,7 @@ class _Pace:
         self._ends: list[float] = []
 
     def progress(self, generation: search.Generation) -> Progress:
-        """What is known at a generation's end; volumes are of the `sampled` rung, NaN where there is none."""
+        """What is known at a generation's end; volumes are sampled, NaN where there is none."""
         self._ends.append(self._clock.elapsed)
         done, later = generation.index + 1, len(self._ends) - 1
         seconds = (self._ends[-1] - self._ends[0]) / later if later else math.nan
@@ -145,14 +145,14 @@ def _store(problem: Problem, elites: Sequence[Reported], initial: Reported, run:
     run.write_elites((arrays_of(problem, elite.evaluation), record_of(problem, *elite)) for elite in elites)
     run.tell_time()
     run.write_initial(arrays_of(problem, initial.evaluation), record_of(problem, *initial))
-    for line in _summary(problem, initial, elites[0]):
+    for line in summary(problem, initial, elites[0]):
         console.message(line)
     if compared := [reported.physics for reported in (*elites, initial) if reported.physics is not None]:
         console.message(physics_line(compared))
     console.message(f"{len(elites)} elites in {run.path}")
 
 
-def _summary(problem: Problem, initial: Reported, best: Reported) -> Iterator[str]:
+def summary(problem: Problem, initial: Reported, best: Reported) -> Iterator[str]:
     """The volumes of the initial and the best candidate with their spreads and ratios, and what the best one is."""
     before, after = record_of(problem, *initial), record_of(problem, *best)
     yield f"{'volume (sampled)':18}{'initial':>12}{'spread':>9}{'best':>12}{'spread':>9}{'ratio':>9}"

@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int, Key
 
 from rtcd_jax.evaluation import Evaluate
+from rtcd_jax.search.archive import where
 from rtcd_jax.system.cluster import Cluster
 from rtcd_jax.types import Evaluation, Volumes
 
@@ -26,7 +27,7 @@ POLL = 0.01
 @final
 @dataclass(frozen=True)
 class Sharded:
-    """A population's evaluation. The numbers that a search looks at are at hand, volumes but for those of the knots;
+    """A population's evaluation. The numbers that a search needs are on the host, volumes but for those of the knots;
     whole records stay on the devices until they are taken."""
 
     genome: Float[np.ndarray, "P d"]
@@ -39,11 +40,11 @@ class Sharded:
         """The whole records [E] of these candidates, in numpy."""
         size = self._parts[0].status.shape[0]
         first, *others = np.unique(rows // size)
-        found = self._fetch(self._parts[first], rows % size)
+        records = self._fetch(self._parts[first], rows % size)
         for index in others:
             part = self._fetch(self._parts[index], rows % size)
-            found = jax.tree.map(partial(_where, rows // size == index), part, found)
-        return found
+            records = jax.tree.map(partial(where, rows // size == index), part, records)
+        return records
 
 
 def sharded(
@@ -64,14 +65,15 @@ def sharded(
         padded = np.concatenate([genomes, np.repeat(genomes[-1:], -count % size, 0)])
         whole = cluster.replicated(jax.random.key_data(key))
         parts = [on_devices(cluster.split(part), whole) for part in np.split(padded, len(padded) // size)]
-        seen = [_seen(cluster, part) for part in parts]
-        status, volumes = jax.tree.map(lambda *leaves: np.concatenate(leaves)[:count], *seen)
+        summaries = [_summary(cluster, part) for part in parts]
+        status, volumes = jax.tree.map(lambda *leaves: np.concatenate(leaves)[:count], *summaries)
         return Sharded(genomes, status, volumes, tuple(parts), fetch)
 
     return evaluate_all
 
 
-def _seen(cluster: Cluster, part: Evaluation) -> tuple[np.ndarray, Volumes]:
+def _summary(cluster: Cluster, part: Evaluation) -> tuple[np.ndarray, Volumes]:
+    """Statuses and volumes, but those of the knots, on the host as soon as the chunk is done."""
     done = cast(Any, part.status).is_ready
     while not done():
         time.sleep(POLL)
@@ -87,12 +89,8 @@ def _rows(chunk: int, part: Evaluation, wanted: Int[Array, " E"]) -> Evaluation:
 
 def _fetch(cluster: Cluster, rows: Callable, chunk: int, part: Evaluation, wanted: Int[np.ndarray, " E"]) -> Evaluation:
     """The wanted records of a part, whose device is known by their place."""
-    found = cluster.gathered(rows(part, cluster.replicated(wanted)))
+    records = cluster.gathered(rows(part, cluster.replicated(wanted)))
     devices, count = len(cluster.devices), len(wanted)
     return jax.tree.map(
-        lambda leaf: leaf.reshape(devices, count, *leaf.shape[1:])[wanted // chunk, np.arange(count)], found
+        lambda leaf: leaf.reshape(devices, count, *leaf.shape[1:])[wanted // chunk, np.arange(count)], records
     )
-
-
-def _where(here: np.ndarray, new: np.ndarray, old: np.ndarray) -> np.ndarray:
-    return np.where(here.reshape(-1, *(1,) * (new.ndim - 1)), new, old)

@@ -62,7 +62,7 @@ def read_cases(path: Path, folder: Path) -> list[Case]:
     cases = []
     for number, values in enumerate(_combinations(section)):
         name = _name(number, values)
-        config = parse(_with(data, values, path), f"{path}, case {name}")
+        config = parse(_with_values(data, values, path), f"{path}, case {name}")
         cases.append(Case(number, values, config, folder / name))
     return cases
 
@@ -105,7 +105,7 @@ def _combinations(section: Mapping[str, Any]) -> Iterator[dict[str, Any]]:
             yield dict(zip([*product, *zipped], [*values, *row], strict=True))
 
 
-def _with(data: Mapping[str, Any], values: Mapping[str, Any], path: Path) -> dict[str, Any]:
+def _with_values(data: Mapping[str, Any], values: Mapping[str, Any], path: Path) -> dict[str, Any]:
     """The configuration with its values set; sections that the file leaves to the defaults are made."""
     changed: dict[str, Any] = copy.deepcopy(dict(data))
     for key, value in values.items():
@@ -134,7 +134,7 @@ def show(cases: Sequence[Case]) -> str:
     rows = [_row(case) for case in cases]
     headings = ("case", *cases[0].values, "generations", "initial", "best", "ratio")
     cells = [_cells(case, row) for case, row in zip(cases, rows, strict=True)]
-    return table(headings, cells, "volumes are of the sampled rung")
+    return table(headings, cells, "volumes are sampled")
 
 
 def store(cases: Sequence[Case], folder: Path) -> Path:

@@ -1,4 +1,4 @@
-"""The archive: the best evaluations that a search has seen, no two of them closer than a distance."""
+"""The archive: the best evaluations of a search, no two of them closer than a distance."""
 
 import functools
 from typing import Protocol, final
@@ -7,13 +7,13 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from rtcd_jax.types import Evaluation, Status, Volumes
 
 
 class Evaluated(Protocol):
-    """A population's evaluation, wherever its records are: an Evaluation, or one that is spread over devices."""
+    """A population's evaluation, wherever its records are: an Evaluation, or one that is sharded over devices."""
 
     @property
     def genome(self) -> Float[Array | np.ndarray, "P d"]: ...
@@ -77,17 +77,17 @@ def merge(
     capacity = elites.costs.shape[0]
     costs = jnp.concatenate([elites.costs, cost(evaluation, objective)])
     genomes = jnp.concatenate([elites.evaluation.genome, jnp.asarray(evaluation.genome)])
-    chosen, kept = jax.device_get(_choose(costs, genomes, distance, capacity))
-    filled, enters = np.isfinite(kept), chosen >= capacity
+    chosen, best = jax.device_get(_choose(costs, genomes, distance, capacity))
+    filled, enters = np.isfinite(best), chosen >= capacity
     stays = np.minimum(chosen, capacity - 1)
     records = jax.tree.map(lambda leaf: np.asarray(leaf)[stays], elites.evaluation)
     if np.any(filled & enters):
         fresh = evaluation.take(np.where(filled & enters, chosen, chosen[filled & enters][0]) - capacity)
-        records = jax.tree.map(lambda new, old: np.where(_like(enters, new), new, old), fresh, records)
+        records = jax.tree.map(lambda new, old: where(enters, new, old), fresh, records)
     born = np.broadcast_to(np.asarray(generation, np.int32), evaluation.status.shape)
-    found = Elites(records, kept, jnp.concatenate([elites.generations, born])[chosen])
+    merged = Elites(records, best, jnp.concatenate([elites.generations, born])[chosen])
     blank = empty(capacity, elites.evaluation)
-    return jax.tree.map(lambda new, old: jnp.asarray(np.where(_like(filled, new), new, old)), found, blank)
+    return jax.tree.map(lambda new, old: jnp.asarray(where(filled, new, old)), merged, blank)
 
 
 @functools.partial(jax.jit, static_argnums=3)
@@ -102,5 +102,6 @@ def _choose(costs: Float[Array, " K"], genomes: Float[Array, "K d"], distance: f
     return jax.lax.scan(choose, costs, length=count)[1]
 
 
-def _like(mask, leaf):
-    return mask.reshape(mask.shape + (1,) * (leaf.ndim - 1))
+def where(mask: Bool[np.ndarray, " E"], new: np.ndarray, old: np.ndarray) -> np.ndarray:
+    """Rows [E …] of `new` where the mask holds, of `old` elsewhere."""
+    return np.where(mask.reshape(-1, *(1,) * (new.ndim - 1)), new, old)

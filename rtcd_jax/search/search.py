@@ -90,7 +90,7 @@ class Generation:
     """What one generation found, on the host; volumes are NaN where a candidate failed.
 
     `volumes` are [P] each by the objectives' names; `best` and `median` (over the feasible) are those of `objective`
-    in this generation, `best_so_far` that of the archive (all sampled rung); `feasible` is a share, `counts` and
+    in this generation, `best_so_far` that of the archive (all sampled); `feasible` is a share, `counts` and
     `stops` leave out what did not occur; `sigma` is the (outer) step size [box widths], `evaluations` and `restarts`
     count from the search's start.
     """
@@ -126,22 +126,23 @@ def start(plan: Plan, example: Evaluation) -> SearchState:
 
 def step(plan: Plan, evaluate: Evaluate, state: SearchState) -> tuple[SearchState, Generation]:
     """One generation: P candidates asked for, evaluated, told, and merged into the elites."""
-    draw, directions, anew = jax.random.split(_key(plan, state.generation), 3)
+    key = jax.random.fold_in(jax.random.key(plan.settings.seed), state.generation)
+    draw, directions, anew = jax.random.split(key, 3)
     strategy, points, genomes = _ask(plan, state.strategy, draw)
     evaluation = evaluate(genomes, directions)
-    seen = _Seen.of(evaluation, plan.settings.objective)
-    strategy, stops = _tell(plan, strategy, points, seen.costs, anew)
+    summary = _Summary.of(evaluation, plan.settings.objective)
+    strategy, stops = _tell(plan, strategy, points, summary.costs, anew)
     after = SearchState(
         strategy=strategy,
         elites=elites.merge(
             state.elites, evaluation, plan.settings.objective, int(state.generation), plan.elites.distance
         ),
         generation=state.generation + 1,
-        evaluations=state.evaluations + len(seen.costs),
+        evaluations=state.evaluations + len(summary.costs),
         restarts=state.restarts + jnp.sum(stops != Stop.NONE, dtype=jnp.int32),
-        counts=state.counts + np.bincount(seen.statuses, minlength=len(Status)).astype(np.int32),
+        counts=state.counts + np.bincount(summary.statuses, minlength=len(Status)).astype(np.int32),
     )
-    return after, _record(plan, after, seen, np.asarray(stops))
+    return after, _record(plan, after, summary, np.asarray(stops))
 
 
 def run(plan: Plan, evaluate: Evaluate, state: SearchState) -> Iterator[tuple[SearchState, Generation]]:
@@ -196,10 +197,6 @@ def _loop(plan: Plan) -> _Loop:
     )
 
 
-def _key(plan: Plan, generation: Int[Array, ""] | int) -> Key[Array, ""]:
-    return jax.random.fold_in(jax.random.key(plan.settings.seed), generation)
-
-
 @functools.partial(jax.jit, static_argnums=0)
 def _ask(plan: Plan, strategy: cmaes.State | NestedState, key: Key[Array, ""]):
     return _loop(plan).ask(strategy, key)
@@ -211,7 +208,7 @@ def _tell(plan: Plan, strategy: cmaes.State | NestedState, points, costs: Float[
 
 
 @final
-class _Seen(NamedTuple):
+class _Summary(NamedTuple):
     """The numbers of a population's evaluation that the search itself looks at, on the host."""
 
     genomes: np.ndarray
@@ -223,32 +220,29 @@ class _Seen(NamedTuple):
     def of(cls, evaluation: Evaluated, objective: str) -> Self:
         volumes = evaluation.volumes.named
         costs = elites.cost(evaluation, objective)
-        seen = cls(*jax.device_get((evaluation.genome, evaluation.status, costs, volumes)))
-        feasible = np.isfinite(seen.costs)
-        return seen._replace(volumes={name: np.where(feasible, v, np.nan) for name, v in seen.volumes.items()})
+        summary = cls(*jax.device_get((evaluation.genome, evaluation.status, costs, volumes)))
+        feasible = np.isfinite(summary.costs)
+        return summary._replace(volumes={name: np.where(feasible, v, np.nan) for name, v in summary.volumes.items()})
 
 
-def _record(plan: Plan, after: SearchState, seen: _Seen, stops: np.ndarray) -> Generation:
+def _record(plan: Plan, after: SearchState, summary: _Summary, stops: np.ndarray) -> Generation:
     objective = plan.settings.objective
-    feasible = np.isfinite(seen.costs)
-    found = seen.volumes[objective][feasible]
+    feasible = np.isfinite(summary.costs)
+    volumes = summary.volumes[objective][feasible]
+    archive = after.elites
     return Generation(
         index=int(after.generation) - 1,
         evaluations=int(after.evaluations),
         objective=objective,
-        best=float(found.max()) if found.size else float("nan"),
-        median=float(np.median(found)) if found.size else float("nan"),
-        best_so_far=_best_so_far(after.elites, objective),
+        best=float(volumes.max()) if volumes.size else float("nan"),
+        median=float(np.median(volumes)) if volumes.size else float("nan"),
+        best_so_far=float(archive.evaluation.volumes[objective][0]) if int(archive.count) else float("nan"),
         feasible=float(feasible.mean()),
-        counts={status.name: n for status in Status if (n := int(np.sum(seen.statuses == status)))},
+        counts={status.name: n for status in Status if (n := int(np.sum(summary.statuses == status)))},
         sigma=float(_loop(plan).sigma(after.strategy)),
         restarts=int(after.restarts),
         stops={reason.name: n for reason in Stop if reason and (n := int(np.sum(stops == reason)))},
-        genomes=seen.genomes,
-        statuses=seen.statuses,
-        volumes=seen.volumes,
+        genomes=summary.genomes,
+        statuses=summary.statuses,
+        volumes=summary.volumes,
     )
-
-
-def _best_so_far(found: Elites, objective: str) -> float:
-    return float(found.evaluation.volumes[objective][0]) if int(found.count) else float("nan")

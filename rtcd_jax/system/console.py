@@ -5,7 +5,7 @@ import io
 import math
 import sys
 import time
-from collections.abc import Container, Iterable, Iterator, Sequence
+from collections.abc import Callable, Container, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from threading import Event, Thread
 from typing import Self, TextIO, final
@@ -119,6 +119,19 @@ class Console:
         finally:
             over.set()
             teller.join()
+
+
+def each_second(console: Console) -> Callable[[int, int, str], None]:
+    """`show(done, total, what)` for steps too short to be shown one by one: once a second at most."""
+    clock, shown = Clock(), 0.0
+
+    def show(done: int, total: int, what: str) -> None:
+        nonlocal shown
+        if clock.elapsed - shown >= 1:
+            shown = clock.elapsed
+            console.progress(Progress(done, total, f"{what}  {done}/{total}"))
+
+    return show
 
 
 def silent() -> Console:

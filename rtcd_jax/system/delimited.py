@@ -7,6 +7,7 @@
 
 import csv
 import io
+import math
 import re
 from collections.abc import Iterator, Sequence
 from itertools import chain
@@ -16,7 +17,7 @@ from typing import NamedTuple
 from rtcd_jax.system.errors import UserError, printable
 
 SEPARATORS = (";", "\t", "|", ",")
-"""In the order in which they are believed: a comma may be a decimal one beside the others."""
+"""In the order in which they are tried: beside the others, a comma may be a decimal one."""
 _PROBED = 20
 """Lines from which the separator is found."""
 _LISTED = 40
@@ -50,7 +51,8 @@ def read_table(path: Path, what: str) -> Table:
     above: list[str] = []
     for number, cells in lines:
         if _is_data(cells):
-            return Table(path, tuple(above), _without_comments(chain([(number, cells)], lines)))
+            rows = ((line, row) for line, row in chain([(number, cells)], lines) if not row[0].startswith("#"))
+            return Table(path, tuple(above), rows)
         above = [cells[0].lstrip("#").strip(), *cells[1:]]
     if not above:
         raise UserError(f"{path} is empty: must be {what}")
@@ -62,6 +64,14 @@ def number_in(cell: str) -> float:
     if not cell.isascii() or "_" in cell:  # Python would take 1_0 and Arabic digits
         raise ValueError(cell)
     return float(cell.replace(",", ".") if "." not in cell else cell)
+
+
+def number_or_nan(cell: str) -> float:
+    """The number in a cell, nan for anything else."""
+    try:
+        return number_in(cell)
+    except ValueError:
+        return math.nan
 
 
 def listed(headings: Sequence[str]) -> str:
@@ -139,10 +149,6 @@ def _is_number(cell: str) -> bool:
     except ValueError:
         return False
     return True
-
-
-def _without_comments(rows: Iterator[Row]) -> Iterator[Row]:
-    return ((line, cells) for line, cells in rows if not cells[0].startswith("#"))
 
 
 def words(heading: str) -> list[str]:

@@ -7,7 +7,7 @@ import math
 import os
 import zipfile
 import zlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Container, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -37,6 +37,20 @@ def make_folder(path: Path) -> None:
         path.mkdir(parents=True, exist_ok=True)
         if not os.access(path, os.W_OK):  # known before the work, not after it
             raise PermissionError(errno.EACCES, "it is read-only")
+
+
+def require_own_folder(path: Path, kind: str, owned: bool, besides: Container[str] = ()) -> None:
+    """Raises UserError unless a `kind` of result may be written here: a new or empty folder, or one it `owned` before.
+
+    Temporary files and those named in `besides` do not count.
+    """
+    if path.exists() and not path.is_dir():
+        raise UserError(f"{path} is a file: {kind} needs a folder")
+    if owned or not path.exists():
+        return
+    foreign = sorted(item.name for item in path.iterdir() if item.name not in besides and not is_temporary(item))
+    if foreign:
+        raise UserError(f"{path} is not empty and not {kind}: it has {', '.join(foreign[:5])}; choose another folder")
 
 
 def replace_json(path: Path, record: Mapping[str, Any]) -> None:
@@ -76,10 +90,10 @@ def read_json(path: Path, advice: str) -> dict[str, Any]:
     with reading(path, advice):
         if path.exists() and not path.is_file():  # a pipe would be waited for
             raise TypeError("it is no file")
-        found = json.loads(path.read_text(encoding="utf-8"))
-        if not isinstance(found, dict):
-            raise TypeError(f"must be a JSON object, is {found!r:.40}")
-        return found
+        content = json.loads(path.read_text(encoding="utf-8"))
+        if not isinstance(content, dict):
+            raise TypeError(f"must be a JSON object, is {content!r:.40}")
+        return content
 
 
 _DAMAGED = OSError, EOFError, KeyError, TypeError, ValueError, RecursionError, NotImplementedError
@@ -95,8 +109,8 @@ def reading(path: Path, advice: str) -> Iterator[None]:
         raise
     except (*_DAMAGED, zipfile.BadZipFile, zlib.error) as error:
         lacks = "it lacks " if isinstance(error, KeyError) else ""
-        told = getattr(error, "strerror", None) or lacks + " ".join(str(error).split()) or type(error).__name__
-        raise UserError(f"cannot read {path}: {told}; {advice}") from error
+        reason = getattr(error, "strerror", None) or lacks + " ".join(str(error).split()) or type(error).__name__
+        raise UserError(f"cannot read {path}: {reason}; {advice}") from error
 
 
 @contextlib.contextmanager

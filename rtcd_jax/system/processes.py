@@ -34,23 +34,23 @@ _TIDY = "ignore:resource_tracker:UserWarning"
 
 
 @contextmanager
-def processes(count: int, prepare: Callable[..., None] | None = None, *told: Any) -> Iterator[ProcessPoolExecutor]:
-    """`count` processes, each of which first calls `prepare` with what it is told; what still waits is dropped."""
+def processes(count: int, prepare: Callable[..., None] | None = None, *arguments: Any) -> Iterator[ProcessPoolExecutor]:
+    """`count` processes, each of which first calls `prepare(*arguments)`; at the end, tasks that wait are dropped."""
     # multiprocessing's own tidying process would count on stderr what a process that leaves at once has left to it.
     warnings = os.environ.get("PYTHONWARNINGS", "")
     if _TIDY not in warnings:
         os.environ["PYTHONWARNINGS"] = f"{warnings},{_TIDY}".lstrip(",")
-    with ProcessPoolExecutor(count, CONTEXT, _begin, (prepare, *told)) as pool:
+    with ProcessPoolExecutor(count, CONTEXT, _begin, (prepare, *arguments)) as pool:
         try:
             yield pool
         finally:
             pool.shutdown(wait=False, cancel_futures=True)
 
 
-def _begin(prepare: Callable[..., None] | None, *told: Any) -> None:
+def _begin(prepare: Callable[..., None] | None, *arguments: Any) -> None:
     Thread(target=_end_with_parent, daemon=True).start()
     if prepare is not None:
-        prepare(*told)
+        prepare(*arguments)
 
 
 def _end_with_parent() -> None:

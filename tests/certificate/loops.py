@@ -33,11 +33,11 @@ class Simulated:
             k, start, end = piece["knot"], *(float.fromhex(piece[key]) for key in ("start", "end"))
             step = (end - start) / self.steps
             for i in range(self.steps):
-                x = self._step(lambda x, t, k=k: self._tracking(k, t, x), x, start + i * step, step)
+                x = self.step(lambda x, t, k=k: self.tracking(k, t, x), x, start + i * step, step)
                 levels.append(self._level(piece, k, start + (i + 1) * step, -1 + 2 * (i + 1) / self.steps, x))
-        return levels, self._goal_levels(x)
+        return levels, self.goal_levels(x)
 
-    def _tracking(self, k, t, x):
+    def tracking(self, k, t, x):
         gain = (1 - t) * self.K[k] + t * self.K[k + 1]
         u = self.u[k] - gain @ (x - self.nominal(k, t)[:, None])
         return self.dt * self.rate(x, np.clip(u, -self.limit, self.limit), self.parameters)
@@ -48,7 +48,7 @@ class Simulated:
         axes = straight + (1 - s * s) * (bend[0] + s * bend[1])
         return np.linalg.norm(np.linalg.solve(axes, x - self.nominal(k, t)[:, None]), axis=0).max()
 
-    def _goal_levels(self, x, duration=12.0, step=0.01):
+    def goal_levels(self, x, duration=12.0, step=0.01):
         def held(x, _):
             u = -self.goal_gain @ (x - self.goal[:, None])
             return self.rate(x, np.clip(u, -self.limit, self.limit), self.parameters)
@@ -56,11 +56,11 @@ class Simulated:
         levels = []
         for _ in range(round(duration / step)):
             levels.append(np.linalg.norm(np.linalg.solve(self.goal_axes, x - self.goal[:, None]), axis=0))
-            x = self._step(held, x, 0.0, step)
+            x = self.step(held, x, 0.0, step)
         return np.array(levels)
 
     @staticmethod
-    def _step(f, x, t, h):
+    def step(f, x, t, h):
         a = f(x, t)
         b = f(x + h / 2 * a, t + h / 2)
         c = f(x + h / 2 * b, t + h / 2)

@@ -23,11 +23,11 @@ def funnel():
 def test_attraction_weighs_the_narrow_directions():
     """G^-a with trace n: none at 0; the more, the more the largest level set of V inside the ellipsoid counts."""
     g = np.array([[4.0, 1.0], [1.0, 0.5]])
-    np.testing.assert_allclose(backward._importance(g, 0.0), np.eye(2), atol=1e-12)
+    np.testing.assert_allclose(backward.importance(g, 0.0), np.eye(2), atol=1e-12)
     inverse = np.linalg.inv(g)
-    np.testing.assert_allclose(backward._importance(g, 1.0), 2 * inverse / np.trace(inverse), rtol=1e-12)
+    np.testing.assert_allclose(backward.importance(g, 1.0), 2 * inverse / np.trace(inverse), rtol=1e-12)
     least = np.linalg.eigh(g)[1][:, 0]
-    np.testing.assert_allclose(backward._importance(g, 40.0), 2 * np.outer(least, least), atol=1e-9)
+    np.testing.assert_allclose(backward.importance(g, 40.0), 2 * np.outer(least, least), atol=1e-9)
 
 
 def test_free_shapes_obey_the_sampled_inequality(funnel):

@@ -87,7 +87,7 @@ def test_the_goal_region_lies_in_the_simulated_one(content):
     """From all over it, far out too; 10 % more in every direction would leave the limit on the speed."""
     loop = Simulated(content)
     start = loop.goal[:, None] + loop.goal_axes @ ball(2000)
-    levels = loop._goal_levels(start)
+    levels = loop.goal_levels(start)
     assert levels.max() <= 1 + ROUNDING
     assert levels[-1].max() < 1e-3
     assert 1.1 * np.linalg.norm(loop.goal_axes[1]) > 7

@@ -54,19 +54,19 @@ def test_motions_are_those_of_an_outside_integrator(content):
     """One motion from the inlet to t_N, beside scipy's at 1e-12."""
     motions = Motions(content)
     y = np.array([0.6, -0.8])
-    x = motions._nominal(0, 0.0) + motions.intervals[0].axes(0.0) @ y
+    x = motions.nominal(0, 0.0) + motions.intervals[0].axes(0.0) @ y
     gains, inputs = floats(content["claim"]["K"]), floats(content["claim"]["u"])
     for k, u in enumerate(inputs):
 
         def slope(t, x, k=k, u=u):
             share = t / swing.DT
             gain = (1 - share) * gains[k] + share * gains[k + 1]
-            return swing.rate(x, np.clip(u - gain @ (x - motions._nominal(k, share)), -2.5, 2.5))
+            return swing.rate(x, np.clip(u - gain @ (x - motions.nominal(k, share)), -2.5, 2.5))
 
         outside = solve_ivp(slope, (0, swing.DT), x, rtol=1e-12, atol=1e-12, max_step=1e-3).y[:, -1]
         ours = x[:, None]
         for i in range(64):
-            ours = motions._steps(motions._tracking(k), i * swing.DT / 64, swing.DT / 64, ours, 1)
+            ours = motions.advanced(motions.tracking(k), i * swing.DT / 64, swing.DT / 64, ours, 1)
         np.testing.assert_allclose(ours[:, 0], outside, rtol=0, atol=1e-7)
         x = outside
 

@@ -59,7 +59,7 @@ class Upright:
 
     def arrive(self, error, duration=8.0, step=0.01):
         for _ in range(round(duration / step)):
-            error = Simulated._step(lambda x, _: self.rate(x), error, 0.0, step)
+            error = Simulated.step(lambda x, _: self.rate(x), error, 0.0, step)
         return self.value(error) < 1e-3 * self.rho
 
     def never_saturated(self, error):

@@ -161,7 +161,7 @@ OTHERS = {
     "no such elite": (["replay", "run", "measured.csv", "--elite", "7"], "run has no elite 007; there are 000"),
     "no elite to export": (["export", "run", "--to", "lab", "--elite", "7"], "run has no elite 007; there are 000"),
     "a file to export to": (["export", "run", "--to", "measured.csv"], "measured.csv is a file: an export needs a"),
-    "a run to export to": (["export", "run", "--to", "run"], "run is not empty and no former export: it has .lock"),
+    "a run to export to": (["export", "run", "--to", "run"], "run is not empty and not an export: it has .lock"),
     "no certificate": (["check", "run/no.json"], "run/no.json: No such file or directory; a certificate is"),
     "a folder to check": (["check", "run"], "run: Is a directory; a certificate is RUN/certificates/NNN.json"),
     "nothing to check": (["check"], "0 files: must be one, as in `rtcd check"),
@@ -192,7 +192,7 @@ def test_an_audit_does_not_write_over_a_run(run, capsys):
     """Its results are two elites, of the same names."""
     elite = (run / "elites" / "000.npz").read_bytes()
     given = str(table(Path("given.csv")))
-    assert "--out = run: must be a new or empty folder" in refused(["audit", given, *ARGUMENTS, "--out", "run"], capsys)
+    assert "run is not empty and not an audit: it has " in refused(["audit", given, *ARGUMENTS, "--out", "run"], capsys)
     assert (run / "elites" / "000.npz").read_bytes() == elite
     assert cli.main(["audit", given, *ARGUMENTS, "--out", "out", "--states", "9"]) in (0, 1)
     assert cli.main(["audit", given, *ARGUMENTS, "--out", "out", "--states", "9"]) in (0, 1)

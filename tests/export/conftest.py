@@ -9,20 +9,8 @@ import pytest
 from rtcd_jax.certificate.prove.certify import certify_elite
 from rtcd_jax.export import export_run, rate
 from rtcd_jax.export.bundle import Bundle, read_bundle
+from tests.consoles import Output
 from tests.export.folders import ELITES, run_folder
-
-
-class Silent:
-    """A console that remembers."""
-
-    def __init__(self):
-        self.lines = []
-
-    def message(self, text):
-        self.lines.append(text)
-
-    def progress(self, now):
-        assert 0 <= now.done <= now.total
 
 
 class Export(NamedTuple):
@@ -60,7 +48,7 @@ def proved(tmp_path_factory):
 
 
 def _exported(run, folder):
-    export_run(run, 0, folder, Silent())
+    export_run(run, 0, folder, Output().console)
     bundle = read_bundle(run, "000")
     return Export(run, folder, bundle, module(folder / f"{bundle.label}_controller.py"))
 

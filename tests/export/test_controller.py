@@ -10,12 +10,12 @@ import sys
 import numpy as np
 import pytest
 
-from rtcd_jax.elite.closed_loop import ClosedLoop, Outcome, _outside, runge_kutta, settling_time, simulate
+from rtcd_jax.elite.closed_loop import ClosedLoop, Outcome, outside_limits, runge_kutta, settling_time, simulate
 from rtcd_jax.elite.simulators import simulators_of
 from rtcd_jax.export import export_run
 from rtcd_jax.export.bundle import read_bundle
 from rtcd_jax.system.errors import UserError
-from tests.export.conftest import Silent
+from tests.consoles import Output
 from tests.export.folders import ELITES, run_folder
 
 STEPS = 10  # in an interval
@@ -194,7 +194,7 @@ def test_c_mujoco_under_the_exported_controller_gives_the_verifications_outcome(
 def _driven(elite, control, monitor, march, f, knots, states) -> Outcome:
     """`simulate` with a controller that knows the time alone, and the monitor's verdicts at the knots."""
     x = states.copy()
-    outside, left = _outside(elite, x), np.zeros(len(x), bool)
+    outside, left = outside_limits(elite, x), np.zeros(len(x), bool)
     dt, last = elite.time[1], elite.time[-1]
 
     def advance(moving, start, end):
@@ -204,7 +204,7 @@ def _driven(elite, control, monitor, march, f, knots, states) -> Outcome:
 
         beyond = np.zeros(moving.size, bool)
         for now in march(policy, start, end, x[moving]):
-            beyond |= _outside(elite, now)
+            beyond |= outside_limits(elite, now)
             x[moving] = now
         outside[moving] |= beyond
 
@@ -326,7 +326,7 @@ def two(tmp_path_factory):
     bundles = {}
     for plant in ELITES:
         run = run_folder(path / plant, plant)
-        export_run(run, 0, path / f"lab_{plant}", Silent())
+        export_run(run, 0, path / f"lab_{plant}", Output().console)
         bundles[plant] = read_bundle(run, "000")
     return path, bundles
 
@@ -365,11 +365,11 @@ def test_two_exports_live_in_one_python_process(two):
 def test_two_elites_of_one_robot_are_told_apart_by_a_name(tmp_path):
     run = run_folder(tmp_path / "run", "pendulum")
     for label in ("before", "after"):
-        export_run(run, 0, tmp_path / label, Silent(), label)
+        export_run(run, 0, tmp_path / label, Output().console, label)
         assert (tmp_path / label / f"{label}_controller.py").is_file()
         flags = [*STRICT, "-c", f"{label}_controller.c", "-o", f"../{label}.o"]
         subprocess.run([COMPILER, *flags], cwd=tmp_path / label, check=True)
     merged = subprocess.run([shutil.which("ld") or "ld", "-r", "before.o", "after.o", "-o", "both.o"], cwd=tmp_path)
     assert merged.returncode == 0
     with pytest.raises(UserError, match=r"name 'my-robot': must be a letter and up to 63 letters, digits and _"):
-        export_run(run, 0, tmp_path / "third", Silent(), "my-robot")
+        export_run(run, 0, tmp_path / "third", Output().console, "my-robot")

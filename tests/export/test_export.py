@@ -14,7 +14,8 @@ from rtcd_jax.elite.records import read_elite
 from rtcd_jax.export import export_run
 from rtcd_jax.system.errors import UserError
 from tests.certificate.test_check import resealed
-from tests.export.conftest import Silent, module
+from tests.consoles import Output
+from tests.export.conftest import module
 from tests.export.folders import run_folder
 
 
@@ -88,12 +89,12 @@ def test_the_mark_has_the_digest_of_every_file(export):
 
 
 def test_exports_of_the_same_elite_are_equal_bit_by_bit(export, tmp_path):
-    console = Silent()
-    export_run(export.run, 0, tmp_path / "again", console)
+    output = Output()
+    export_run(export.run, 0, tmp_path / "again", output.console)
     for path in export.folder.iterdir():
         if path.is_file():
             assert (tmp_path / "again" / path.name).read_bytes() == path.read_bytes()
-    assert "is in" in console.lines[0]
+    assert any("elite 000, is in" in line for line in output.lines)
 
 
 def listing(target, **files):
@@ -105,15 +106,14 @@ def listing(target, **files):
 
 def test_a_former_export_is_replaced_and_its_stale_files_go(run, tmp_path):
     target = tmp_path / "lab"
-    export_run(run, 0, target, Silent())
+    export_run(run, 0, target, Output().console)
     (target / "certificate.json").write_text("old")
     (target / "notes.txt").write_text("mine")
     (target / "gains.csv").write_text("old")
     listing(target, **{"certificate.json": b"old"})
-    console = Silent()
-    export_run(run, "initial", target, console)
-    assert "elite initial" in console.lines[0]
-    assert "replaces the former export" in console.lines[0]
+    output = Output()
+    export_run(run, "initial", target, output.console)
+    assert any("elite initial, replaces the former export" in line for line in output.lines)
     assert not (target / "certificate.json").exists()
     assert not (target / "pendulum_000_controller.py").exists()
     assert (target / "pendulum_initial_controller.py").is_file()
@@ -125,50 +125,50 @@ def test_a_former_export_is_replaced_and_its_stale_files_go(run, tmp_path):
 def test_what_a_former_exports_mark_names_elsewhere_is_not_touched(run, tmp_path, name):
     target, precious = tmp_path / "lab", tmp_path / "precious.txt"
     precious.write_text("mine")
-    export_run(run, 0, target, Silent())
+    export_run(run, 0, target, Output().console)
     (target / "sub").mkdir()
     listing(target, **{name.format(absolute=precious): b"mine"})
-    export_run(run, 0, target, Silent())
+    export_run(run, 0, target, Output().console)
     assert precious.read_text() == "mine"
 
 
 def test_no_link_is_followed_or_deleted(run, tmp_path):
     target, precious = tmp_path / "lab", tmp_path / "precious.txt"
     precious.write_text("mine")
-    export_run(run, 0, target, Silent())
+    export_run(run, 0, target, Output().console)
     for name in ("stale.txt", "gains.csv", ".funnel.csv.tmp"):
         (target / name).unlink(missing_ok=True)
         (target / name).symlink_to(precious)
     listing(target, **{"stale.txt": b"mine"})
-    console = Silent()
-    export_run(run, 0, target, console)
+    output = Output()
+    export_run(run, 0, target, output.console)
     assert precious.read_text() == "mine"
     assert (target / "stale.txt").is_symlink()
     assert not (target / "gains.csv").is_symlink()
-    assert any("left where they are" in line and "stale.txt" in line for line in console.lines)
+    assert any("left where they are" in line and "stale.txt" in line for line in output.lines)
 
 
 def test_a_file_that_was_changed_since_is_not_deleted(run, tmp_path):
     target = tmp_path / "lab"
-    export_run(run, 0, target, Silent())
+    export_run(run, 0, target, Output().console)
     edited = target / "pendulum_000_controller.py"
     edited.write_text("# mine")
-    console = Silent()
-    export_run(run, "initial", target, console)
+    output = Output()
+    export_run(run, "initial", target, output.console)
     assert edited.read_text() == "# mine"
-    assert any("pendulum_000_controller.py" in line for line in console.lines)
+    assert any("pendulum_000_controller.py" in line for line in output.lines)
     assert not (target / "pendulum_000_controller.c").exists()
 
 
 def test_a_file_that_no_export_has_written_is_not_replaced(run, tmp_path):
     target = tmp_path / "lab"
-    export_run(run, 0, target, Silent())
+    export_run(run, 0, target, Output().console)
     mark = json.loads((target / "export.json").read_text())
     del mark["files"]["README.md"]
     (target / "export.json").write_text(json.dumps(mark))
     (target / "README.md").write_text("mine")
     with pytest.raises(UserError, match=r"lab has README.md, which the former export has not written: move it away"):
-        export_run(run, 0, target, Silent())
+        export_run(run, 0, target, Output().console)
     assert (target / "README.md").read_text() == "mine"
 
 
@@ -178,8 +178,8 @@ def test_a_mark_that_no_export_has_written_is_none(run, tmp_path, mark):
     target.mkdir()
     (target / "export.json").write_text(mark)
     (target / "thesis.tex").write_text("all")
-    with pytest.raises(UserError, match="is not empty and no former export"):
-        export_run(run, 0, target, Silent())
+    with pytest.raises(UserError, match="is not empty and not an export"):
+        export_run(run, 0, target, Output().console)
 
 
 def test_an_export_that_a_kill_has_left_half_done_says_so_and_is_taken_up(run, tmp_path, monkeypatch):
@@ -191,9 +191,9 @@ def test_an_export_that_a_kill_has_left_half_done_says_so_and_is_taken_up(run, t
     with monkeypatch.context() as patch:
         patch.setattr("rtcd_jax.export.replace", killed)
         with pytest.raises(KeyboardInterrupt):
-            export_run(run, 0, target, Silent())
+            export_run(run, 0, target, Output().console)
     assert json.loads((target / "export.json").read_text())["complete"] is False
-    export_run(run, 0, target, Silent())
+    export_run(run, 0, target, Output().console)
     assert json.loads((target / "export.json").read_text())["complete"] is True
 
 
@@ -201,28 +201,28 @@ def test_a_folder_of_something_else_is_left_alone(run, tmp_path):
     target = tmp_path / "mine"
     target.mkdir()
     (target / "thesis.tex").write_text("all")
-    with pytest.raises(UserError, match=r"mine is not empty and no former export: it has thesis.tex"):
-        export_run(run, 0, target, Silent())
+    with pytest.raises(UserError, match=r"mine is not empty and not an export: it has thesis.tex"):
+        export_run(run, 0, target, Output().console)
     (target / "export.json").write_text('{"format": "another"}')
-    with pytest.raises(UserError, match=r"not empty and no former export: it has export.json, thesis.tex"):
-        export_run(run, 0, target, Silent())
+    with pytest.raises(UserError, match=r"not empty and not an export: it has export.json, thesis.tex"):
+        export_run(run, 0, target, Output().console)
     with pytest.raises(UserError, match=r"thesis.tex is a file: an export needs a folder"):
-        export_run(run, 0, target / "thesis.tex", Silent())
+        export_run(run, 0, target / "thesis.tex", Output().console)
     assert sorted(path.name for path in target.iterdir()) == ["export.json", "thesis.tex"]
 
 
 def test_an_elite_that_is_not_there_is_answered_with_those_that_are(run, tmp_path):
     with pytest.raises(UserError, match=r"has no elite 007; there are 000$"):
-        export_run(run, 7, tmp_path / "lab", Silent())
+        export_run(run, 7, tmp_path / "lab", Output().console)
     with pytest.raises(UserError, match=r"no run folder: it has no format"):
-        export_run(tmp_path, 0, tmp_path / "lab", Silent())
+        export_run(tmp_path, 0, tmp_path / "lab", Output().console)
     assert not (tmp_path / "lab").exists()
 
 
 def test_a_candidate_without_a_funnel_is_not_exported(tmp_path):
     run = run_folder(tmp_path / "run", "pendulum", status="FUNNEL_EMPTY")
     with pytest.raises(UserError, match=r"initial has no funnel \(FUNNEL_EMPTY\)"):
-        export_run(run, "initial", tmp_path / "lab", Silent())
+        export_run(run, "initial", tmp_path / "lab", Output().console)
 
 
 def test_a_proved_elites_claim_stands_wherever_its_controller_does(proved):
@@ -262,12 +262,12 @@ def test_a_certificate_that_does_not_prove_this_elite_does_not_go_along(proved, 
     certificate = run / "certificates" / "000.json"
     changed = WORTHLESS[verdict](json.loads(certificate.read_text()))
     certificate.write_text(changed if isinstance(changed, str) else json.dumps(changed))
-    console, target = Silent(), tmp_path / "lab"
-    export_run(run, 0, target, console)
+    output, target = Output(), tmp_path / "lab"
+    export_run(run, 0, target, output.console)
     assert not (target / "certificate.json").exists()
     told = json.loads((target / "pendulum_000_controller.json").read_text())
     assert (told["certificate"], told["monitor"]["guarantee"]) == (None, "sampled")
     assert json.loads((target / "export.json").read_text())["claim"] is None
-    assert f"certificate: {verdict}, so it does not go along: " in console.lines[1]
+    assert f"certificate: {verdict}, so it does not go along: " in output.getvalue()
     assert f"Nothing is proved: the certificate is {verdict}." in (target / "README.md").read_text()
     assert module(target / "pendulum_000_controller.py").CLAIM == ""

@@ -270,7 +270,7 @@ def test_another_configuration_is_refused_with_every_differing_key_and_both_valu
 
 def test_a_folder_with_other_things_in_it_is_refused_and_left_alone(tmp_path):
     (tmp_path / "thesis.tex").write_text("years")
-    assert "no run folder and not empty: it has thesis.tex" in refused(tmp_path)
+    assert "is not empty and not a run: it has thesis.tex" in refused(tmp_path)
     assert [item.name for item in tmp_path.iterdir()] == ["thesis.tex"]
 
 

@@ -13,7 +13,7 @@ from rtcd_jax.config.load import config_hash
 from rtcd_jax.elite.elite import Elite
 from rtcd_jax.elite.records import write_elite
 from rtcd_jax.run.format import arrays_of, epsilon, record_of
-from rtcd_jax.run.optimize import _summary
+from rtcd_jax.run.optimize import summary
 from rtcd_jax.run.reevaluation import Reported
 from rtcd_jax.system.files import plain
 from tests import pipeline
@@ -185,7 +185,7 @@ def test_without_volumes_there_is_no_spread():
 def test_the_summary_has_a_dash_where_a_number_is_none():
     hard, best = _row(pipeline.HARD), _row(pipeline.RTCD)
     initial, first = Reported(hard, [hard, hard], None), Reported(best, [best, best], None)
-    lines = list(_summary(pipeline.problem(), initial, first))
+    lines = list(summary(pipeline.problem(), initial, first))
     total = float(best.volumes["sum"])
     assert lines[1].split() == ["sum", "0", "-", f"{total:.5g}", "0.0%", "-"]
     assert "the initial candidate has no funnel" in lines[5]

@@ -82,7 +82,7 @@ from rtcd_jax.system.cluster import Cluster
 from rtcd_jax.evaluation import make_evaluate
 from rtcd_jax.run.sharding import sharded
 from tests import pipeline
-from tests.test_evaluation import _assert_close
+from tests.test_evaluation import assert_close
 evaluate, rows = make_evaluate(pipeline.problem()), np.arange(5)
 
 def on(devices, genomes):
@@ -92,7 +92,7 @@ genomes = np.asarray(pipeline.genomes())
 one, two, four = (on(devices, genomes).take(rows) for devices in (1, 2, 4))
 assert pipeline.same(two, four)
 assert pipeline.same(on(2, genomes[::-1]).take(rows[::-1]), two)
-_assert_close(one, two)
+assert_close(one, two)
 print("equal")
 """
 

@@ -17,8 +17,6 @@ from rtcd_jax.system.console import Console
 from rtcd_jax.system.devices import require_devices
 from rtcd_jax.system.files import make_folder, replace_json
 
-FOLDER = "disturbance"
-
 
 def disturb_run(folder: Path, states: int, seed: int, console: Console) -> None:
     """Runs all experiments; stores `disturbance/{off_nominal,impulse,robustness}.json` and their figures.
@@ -29,7 +27,7 @@ def disturb_run(folder: Path, states: int, seed: int, console: Console) -> None:
     """
     require_devices()
     comparison = read_comparison(folder, console)
-    place = folder / FOLDER
+    place = folder / "disturbance"
     make_folder(place)
     meter = Meter(console, _all_motions(comparison, states))
 

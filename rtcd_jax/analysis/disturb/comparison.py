@@ -31,8 +31,8 @@ from rtcd_jax.system.console import Clock, Console, Progress, times
 
 BATCH = 2048
 """Rollouts in the compiled program."""
-TELLING = 0.02
-"""Share of the work from which on the time that is left can be told; before it, most was compilation."""
+PREDICTED = 0.02
+"""Share of the work from which on the time left is predicted; before it, most was compilation."""
 REPORTED = 5.0
 """Least time between two lines of progress [s]."""
 
@@ -60,11 +60,11 @@ class Comparison:
 
 @final
 class Meter:
-    """Tells a console how much of all motions is done; of `motions` of `seconds` each."""
+    """Shows on a console how many of all `motions` are done."""
 
     def __init__(self, console: Console, motions: int):
         self._console, self._motions = console, motions
-        self._done = self._told = 0.0
+        self._done = self._reported = 0.0
         self._clock = Clock()
 
     def compiling(self) -> contextlib.AbstractContextManager[None]:
@@ -72,13 +72,13 @@ class Meter:
         return contextlib.nullcontext() if self._done else self._console.waiting("compiling the rollouts")
 
     def tick(self, experiment: str, motions: float) -> None:
-        """That so many more motions are over."""
+        """Counts `motions` more of an experiment as done."""
         self._done += motions
         elapsed = self._clock.elapsed
-        if elapsed - self._told >= REPORTED:
-            self._told = elapsed
+        if elapsed - self._reported >= REPORTED:
+            self._reported = elapsed
             share = min(1.0, self._done / self._motions)
-            shown = self._clock.times(share, 1) if share >= TELLING else times(elapsed, math.nan)
+            shown = self._clock.times(share, 1) if share >= PREDICTED else times(elapsed, math.nan)
             self._console.progress(Progress(share, 1, f"{experiment:12} {share:4.0%}  {shown}"))
 
 

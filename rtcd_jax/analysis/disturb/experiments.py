@@ -94,11 +94,11 @@ def off_nominal(comparison: Comparison, states: int, seed: int, simulate: Simula
 
 def _starts(elite: Elite, factor: float, states: int, random: np.random.Generator) -> np.ndarray:
     """Uniform states [states n] of the first ellipsoid, enlarged, as far as it lies inside the limits."""
-    found = np.empty((0, elite.x_goal.size))
-    while len(found) < states:
+    inside = np.empty((0, elite.x_goal.size))
+    while len(inside) < states:
         drawn = elite.x[0] + factor * (elite.points(np.zeros(states, int), random) - elite.x[0])
-        found = np.concatenate([found, drawn[np.all(np.abs(drawn) <= elite.state_limits, axis=1)]])
-    return found[:states]
+        inside = np.concatenate([inside, drawn[np.all(np.abs(drawn) <= elite.state_limits, axis=1)]])
+    return inside[:states]
 
 
 def _shares(comparison: Comparison, arrived: np.ndarray) -> Iterator[tuple[str, float]]:
@@ -120,7 +120,7 @@ def impulse(comparison: Comparison, simulate: Simulate) -> dict[str, Any]:
     first = 3 * PUSH_WIDTH
     times = np.stack([first + shares * (elite.time[-1] - first) for elite in comparison.elites])
     loop, when, size = (axis.ravel() for axis in np.indices((len(times), TIMES, SIZES)))
-    rollouts = _from_start(comparison, loop)
+    rollouts = from_start(comparison, loop)
     heights = np.zeros(rollouts.heights.shape)
     heights[0, 0] = impulses[size] / (PUSH_WIDTH * math.sqrt(2 * math.pi))
     rollouts = dataclasses.replace(
@@ -137,7 +137,7 @@ def impulse(comparison: Comparison, simulate: Simulate) -> dict[str, Any]:
         "impulses": impulses,
         "recovered": dict(by_loop(comparison, recovered)),
         "summary": {
-            name: {"recovered": cells.mean(), "largest_at_all_times": _largest_tolerated(impulses, cells)}
+            name: {"recovered": cells.mean(), "largest_at_all_times": largest_tolerated(impulses, cells)}
             for name, cells in by_loop(comparison, recovered)
         },
     }
@@ -164,17 +164,18 @@ def robustness(comparison: Comparison, seed: int, simulate: Simulate) -> dict[st
     Pendubot Platform", IEEE Robotics & Automation Magazine 31(2), 2024), the robot and what counts as success are ours.
     """
     random = np.random.default_rng(seed)
-    found = perturbations(comparison)
-    sizes = [len(perturbation.levels) * perturbation.repeats for perturbation in found]
+    tested = perturbations(comparison)
+    sizes = [len(perturbation.levels) * perturbation.repeats for perturbation in tested]
     loops = len(comparison.names)
     parts = []
-    for perturbation in found:
+    for perturbation in tested:
         level = np.repeat(perturbation.levels, perturbation.repeats)
-        rollouts = _from_start(comparison, np.repeat(np.arange(loops), len(level)))
+        rollouts = from_start(comparison, np.repeat(np.arange(loops), len(level)))
         parts.append(perturbation.apply(rollouts, np.tile(level, loops), random))
-    outcome = simulate(_joined(parts), "robustness", False)
+    together = jax.tree.map(lambda *leaves: jnp.concatenate(leaves, axis=-1), *parts)
+    outcome = simulate(together, "robustness", False)
     stayed = np.split(~outcome.left_limits & (outcome.held <= 1), loops * np.cumsum(sizes)[:-1])
-    successes = [part.reshape(loops, len(each.levels), -1) for part, each in zip(stayed, found, strict=True)]
+    successes = [part.reshape(loops, len(each.levels), -1) for part, each in zip(stayed, tested, strict=True)]
     return {
         "experiment": "the swing-up from its start on a robot that is not as the model says",
         "seed": seed,
@@ -186,18 +187,18 @@ def robustness(comparison: Comparison, seed: int, simulate: Simulate) -> dict[st
                 "levels": perturbation.levels,
                 "success": {name: part.mean(axis=1) for name, part in by_loop(comparison, success)},
             }
-            for perturbation, success in zip(found, successes, strict=True)
+            for perturbation, success in zip(tested, successes, strict=True)
         ],
-        "summary": dict(by_loop(comparison, _scores(found, successes, loops))),
+        "summary": dict(by_loop(comparison, _scores(tested, successes, loops))),
     }
 
 
-def _scores(found: list[Perturbation], successes: list[np.ndarray], loops: int) -> np.ndarray:
+def _scores(tested: list[Perturbation], successes: list[np.ndarray], loops: int) -> np.ndarray:
     """For each loop, every criterion's mean over its perturbations, and the score."""
     scores: list[dict[str, float]] = []
     for loop in range(loops):
         criteria: dict[str, list[float]] = {}
-        for perturbation, success in zip(found, successes, strict=True):
+        for perturbation, success in zip(tested, successes, strict=True):
             criteria.setdefault(perturbation.criterion, []).append(float(success[loop].mean()))
         means = {criterion: float(np.mean(shares)) for criterion, shares in criteria.items()}
         scores.append({"score": float(np.mean([means[criterion] for criterion in SCORED])), **means})
@@ -227,7 +228,7 @@ def perturbations(comparison: Comparison) -> list[Perturbation]:
         Perturbation("delay", "delay", "s", none_to(DELAY), 1,
                 lambda rollouts, level, _: dataclasses.replace(rollouts, delay=_steps(level))),
         Perturbation("perturbation", "perturbation", "profile", np.arange(PROFILES, dtype=float), 1,
-                lambda rollouts, level, random: _perturbed(comparison, rollouts, random)),
+                lambda rollouts, level, random: pulsed(comparison, rollouts, random)),
         Perturbation("control rate", "control rate", "Hz", np.array(RATES, float), 1,
                 lambda rollouts, rate, _: dataclasses.replace(rollouts, period=_steps(1 / rate))),
     ]  # fmt: skip
@@ -260,7 +261,7 @@ def _steps(seconds: np.ndarray) -> jax.Array:
     return jnp.asarray(np.round(seconds / STEP), int)
 
 
-def _perturbed(comparison: Comparison, rollouts: Rollouts, random: np.random.Generator) -> Rollouts:
+def pulsed(comparison: Comparison, rollouts: Rollouts, random: np.random.Generator) -> Rollouts:
     """Random pulses, one in each part of the motion, the same for all loops but for the motions' lengths."""
     inputs = comparison.elites[0].u_max
     shares = (np.arange(PULSES)[:, None] + random.uniform(size=(PULSES, PROFILES))) / PULSES
@@ -276,21 +277,17 @@ def _perturbed(comparison: Comparison, rollouts: Rollouts, random: np.random.Gen
     )
 
 
-def _from_start(comparison: Comparison, loop: np.ndarray) -> Rollouts:
+def from_start(comparison: Comparison, loop: np.ndarray) -> Rollouts:
     """Undisturbed rollouts from the nominal motions' first states."""
     first = np.stack([elite.x[0] for elite in comparison.elites])
     return undisturbed(comparison.plant, comparison.design, loop, first[loop].T)
-
-
-def _joined(parts: list[Rollouts]) -> Rollouts:
-    return jax.tree.map(lambda *leaves: jnp.concatenate(leaves, axis=-1), *parts)
 
 
 def _arrived(outcome: Outcome) -> np.ndarray:
     return ~outcome.left_limits & (outcome.final <= ARRIVED)
 
 
-def _largest_tolerated(impulses: np.ndarray, recovered: np.ndarray) -> float:
+def largest_tolerated(impulses: np.ndarray, recovered: np.ndarray) -> float:
     """The largest |impulse| up to which all pushes, to both sides and at all times, were recovered from."""
     lost = np.abs(impulses)[~recovered.all(axis=0)]
     tolerated = np.abs(impulses)[np.abs(impulses) < lost.min()] if lost.size else np.abs(impulses)

@@ -1,4 +1,4 @@
-"""`disturbance/NAME.png` and `.pdf`: what `rtcd disturb` saw, the initial candidate beside the best one."""
+"""`disturbance/NAME.png` and `.pdf`: the results of `rtcd disturb`, the initial candidate beside the best one."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -49,7 +49,8 @@ def _off_nominal(figure: "Figure", record: Mapping[str, Any]) -> None:
     groups = [rows[first : first + len(factors)] for first in range(0, len(rows), len(factors))]
     panels = figure.subplots(1, len(groups), sharey=True, squeeze=False)[0]
     for axes, group in zip(panels, groups, strict=True):
-        for index, name in enumerate(_controllers(group[0][1])):
+        controllers = [name for name in group[0][1] if not name.endswith((" lower", " upper"))]
+        for index, name in enumerate(controllers):
             share, lower, upper = (
                 np.array([entry[key] for _, entry in group]) for key in (name, f"{name} lower", f"{name} upper")
             )
@@ -62,10 +63,6 @@ def _off_nominal(figure: "Figure", record: Mapping[str, Any]) -> None:
     panels[0].set_ylim(-0.03, 1.03)
     panels[0].set_ylabel(f"arrived, of {record['states']}")
     figure.legend(*panels[0].get_legend_handles_labels(), loc="outside upper center", ncols=2)
-
-
-def _controllers(entry: Mapping[str, float]) -> list[str]:
-    return [name for name in entry if not name.endswith((" lower", " upper"))]
 
 
 def _impulse(figure: "Figure", record: Mapping[str, Any]) -> None:

@@ -7,7 +7,6 @@ while ago and with noise on the velocities; what it asks for lags, is noisy, and
 
 import math
 from collections.abc import Sequence
-from functools import partial
 from typing import Any, NamedTuple, final
 
 import equinox as eqx
@@ -27,7 +26,7 @@ LONGEST_DELAY = 0.1
 PULSES = 3
 """Bell-shaped pushes that a rollout can take."""
 CHUNK = 250
-"""Steps between two looks from outside."""
+"""Steps of one call of the compiled program; between two, the host checks whether all motions are over."""
 WATCHED = 1.0
 """Time at the end in which a motion must hold its place [s]."""
 
@@ -68,9 +67,7 @@ class Loops(eqx.Module):
         k = jnp.minimum(jnp.floor(place).astype(int), self.intervals)
         s = place - k
         row = self.rows[which * (self.intervals + 1) + k]
-        cubics, gains, changes, feedforward = (
-            row[:, start:end] for start, end in _spans(4 * n, m * n, m * n, m)
-        )  # fmt: skip
+        cubics, gains, changes, feedforward = jnp.split(row, np.cumsum([4 * n, m * n, m * n]), axis=1)
         error = []
         for i in range(n):
             c0, c1, c2, c3 = (cubics[:, 4 * i + power] for power in range(4))
@@ -93,7 +90,7 @@ class Loops(eqx.Module):
 
 @final
 class Rollouts(eqx.Module):
-    """L motions and what perturbations them; leaves [L], with the states' or inputs' axis before it.
+    """L motions and what perturbs them; leaves [L], with the states' or inputs' axis before it.
 
     `loop` is the controller's index and `x` the state at t = 0. Of the robot: `plant` and `design` with its true
     numbers, and `actuator_scale`, its true input limit over the nominal one. Of the controller: control period and
@@ -175,6 +172,9 @@ def advance(loops: Loops, rollouts: Rollouts, motion: Motion, first: Int[Array, 
     noisy = jnp.any(rollouts.velocity_noise > 0) | jnp.any(rollouts.input_noise > 0)
     follow = jnp.where(rollouts.lag > 0, -jnp.expm1(-STEP / jnp.maximum(rollouts.lag, STEP * 1e-3)), 1.0)
 
+    def slope(x: tuple, u):
+        return split(rollouts.plant.dynamics(rollouts.design, jnp.stack(x), u))
+
     def step(motion: Motion, index):
         t = index * STEP
         past = motion.past.at[index % len(motion.past)].set(motion.x)
@@ -182,7 +182,7 @@ def advance(loops: Loops, rollouts: Rollouts, motion: Motion, first: Int[Array, 
         given = motion.input + follow * (command - motion.input)
         bound = rollouts.actuator_scale * loops.input_limits[:, None]
         pushed = jnp.clip(given + noise, -bound, bound) + _pushes(rollouts, t + STEP / 2)
-        x = rk4_step(partial(_slope, rollouts), split(motion.x), pushed, STEP)
+        x = rk4_step(slope, split(motion.x), pushed, STEP)
         moved = jnp.where(motion.left, motion.x, jnp.stack(x))
         return Motion(moved, given, command, noise, past, motion.left | ~loops.inside(moved)), None
 
@@ -192,16 +192,16 @@ def advance(loops: Loops, rollouts: Rollouts, motion: Motion, first: Int[Array, 
 def _decide(loops: Loops, rollouts: Rollouts, motion: Motion, past, index, key, noisy):
     """What the controllers ask for after step `index`, and the motors' noise: new where a control period begins."""
     count = len(rollouts.loop)
-    seen = past[(index - rollouts.delay) % len(past), :, jnp.arange(count)].T
+    measured = past[(index - rollouts.delay) % len(past), :, jnp.arange(count)].T
     m, half = loops.input_limits.size, loops.goal.size // 2
 
     def draw():
         return jax.random.normal(jax.random.fold_in(key, index), (half + m, count))
 
     random = jax.lax.cond(noisy, draw, lambda: jnp.zeros((half + m, count)))
-    seen = seen.at[half:].add(rollouts.velocity_noise * random[:half])
+    measured = measured.at[half:].add(rollouts.velocity_noise * random[:half])
     due = index % rollouts.period == 0
-    asked = jnp.stack(loops.law(rollouts.loop, index * STEP, split(seen)))
+    asked = jnp.stack(loops.law(rollouts.loop, index * STEP, split(measured)))
     return jnp.where(due, asked, motion.command), jnp.where(due, rollouts.input_noise * random[half:], motion.noise)
 
 
@@ -210,12 +210,8 @@ def _pushes(rollouts: Rollouts, t) -> Float[Array, "m L"]:
     return jnp.sum(rollouts.heights * bells[:, None], axis=0)
 
 
-def _slope(rollouts: Rollouts, x: tuple, u):
-    return split(rollouts.plant.dynamics(rollouts.design, jnp.stack(x), u))
-
-
 def _rows(elite: Elite, rates: np.ndarray) -> np.ndarray:
-    """[N+1 F]."""
+    """An elite's part of the table [N+1 F]."""
     x, h = elite.x, elite.time[1]
     begin, end, first, last = x[:-1], x[1:], h * rates[:, 0], h * rates[:, 1]
     cubics = np.stack([begin, first, 3 * (end - begin) - 2 * first - last, 2 * (begin - end) + first + last], axis=2)
@@ -224,11 +220,6 @@ def _rows(elite: Elite, rates: np.ndarray) -> np.ndarray:
     still = np.stack([elite.x_goal, *3 * [0 * elite.x_goal]], axis=1).ravel()
     holding = [still, elite.K_goal.ravel(), 0 * elite.K_goal.ravel(), 0 * elite.u_max]
     return np.concatenate([np.concatenate(moving, axis=1), np.concatenate(holding)[None]])
-
-
-def _spans(*sizes: int) -> list[tuple[int, int]]:
-    ends = np.cumsum(sizes).tolist()
-    return list(zip([0, *ends], ends, strict=False))
 
 
 def steps_of(seconds: float) -> int:

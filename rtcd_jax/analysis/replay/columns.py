@@ -64,14 +64,14 @@ def find_columns(table: Table, units: Mapping[str, str], choices: Sequence[str] 
     Raises:
         UserError: a choice that names no state or no column, columns that are missing or there twice.
     """
-    found = dict(_chosen(table, units, choice) for choice in choices)
+    columns = dict(_chosen(table, units, choice) for choice in choices)
     missing, twice = [], []
-    for name in (name for name in units if name not in found):
+    for name in (name for name in units if name not in columns):
         ranked = list(_candidates(table.headings, name, units))
         first = min((rank for rank, _ in ranked), default=None)
         best = [column for rank, column in ranked if rank == first]
         if len(best) == 1:
-            found[name] = best[0]
+            columns[name] = best[0]
         elif best:
             twice.append(f"{name} ({' or '.join(f'{column}, number {column.place + 1}' for column in best)})")
         else:
@@ -81,13 +81,9 @@ def find_columns(table: Table, units: Mapping[str, str], choices: Sequence[str] 
     if problems:
         raise UserError(
             f"{table.path} has {' and '.join(problems)}; its columns: {listed(table.headings)}; choose them by "
-            f"--columns {_example(units)}, COLUMN a name or a number from 1"
+            f"--columns {' '.join(f'{name}=COLUMN' for name in units)}, COLUMN a name or a number from 1"
         )
-    return {name: found[name] for name in units}
-
-
-def _example(units: Mapping[str, str]) -> str:
-    return " ".join(f"{name}=COLUMN" for name in units)
+    return {name: columns[name] for name in units}
 
 
 def _chosen(table: Table, units: Mapping[str, str], choice: str) -> tuple[str, Column]:

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from rtcd_jax.analysis.replay.columns import Column, find_columns
-from rtcd_jax.system.delimited import Table, listed, number_in, read_table, shown
+from rtcd_jax.system.delimited import Table, listed, number_or_nan, read_table, shown
 from rtcd_jax.system.errors import UserError, printable
 
 WHAT = "a CSV of measured states, a line of column names above its rows"
@@ -86,16 +86,16 @@ def unwrapped(measured: Measured, states: Mapping[str, str], first: Float[np.nda
 
 def jumps(measured: Measured, states: Mapping[str, str]) -> list[str]:
     """What looks like an angle that was wrapped: half a turn or more between two samples."""
-    found = []
+    lines = []
     for i, name in _angles(states):
         steps = np.abs(np.diff(measured.x[:, i]))
         if steps.size and steps.max() >= np.pi:
             k = int(steps.argmax())
-            found.append(
+            lines.append(
                 f"{name} jumps by {steps[k]:.3g} rad at t = {measured.time[k + 1]:.4g} s: if the encoder wraps, give "
                 "--unwrap, since errors of angles are not wrapped here"
             )
-    return found
+    return lines
 
 
 def _angles(states: Mapping[str, str]) -> list[tuple[int, str]]:
@@ -121,10 +121,7 @@ def _samples(table: Table, columns: Mapping[str, Column]) -> tuple[list[int], np
 
 def _number(table: Table, line: int, cells: Sequence[str], column: Column) -> float:
     cell = cells[column.place] if column.place < len(cells) else ""
-    try:
-        value = number_in(cell)
-    except ValueError:
-        value = math.nan
+    value = number_or_nan(cell)
     if not abs(value) <= LARGEST:
         raise UserError(
             f"{table.path}, line {line}: {printable(column.heading, 40)} = {shown(cell)}: must be a finite number, of "

@@ -1,8 +1,7 @@
 """A finished run as reports show it: everything that its folder holds, checked once and given names."""
 
 import itertools
-import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, final
@@ -20,7 +19,7 @@ from rtcd_jax.elite.records import (
     read_elite,
     read_generations,
 )
-from rtcd_jax.system.console import Console, Progress, silent
+from rtcd_jax.system.console import Console, each_second, silent
 from rtcd_jax.system.errors import UserError, printable
 from rtcd_jax.system.files import read_json, reading
 from rtcd_jax.volume import VOLUMES
@@ -220,12 +219,13 @@ def _same(first: Elite, second: Elite) -> bool:
 
 def _certificates(path: Path, console: Console) -> Iterator[tuple[str, Certificate]]:
     """What `rtcd certify` left, by elite, as far as the files still bear it out."""
-    summary = path / "certificates" / "summary.json"
+    summary, show = path / "certificates" / "summary.json", each_second(console)
     for name, written in _json(summary).items():
         if written is None:
             yield name, Certificate(None, "not found", "no goal region could be shown")
             continue
-        found = standing(path, name, _telling(console, certificate_path(path, name)))
+        what = f"checking {certificate_path(path, name)}  interval"
+        found = standing(path, name, lambda done, total, what=what: show(done, total, what))
         with reading(summary, _ADVICE):
             beside = {"seconds": float(written["seconds"]), "sampled": _numbers(written["sampled"])}
             if found.proved:
@@ -241,19 +241,6 @@ def _certificates(path: Path, console: Console) -> Iterator[tuple[str, Certifica
 
 def _numbers(written: Mapping[str, Any]) -> dict[str, float]:
     return {str(key): float(value) for key, value in written.items()}
-
-
-def _telling(console: Console, file: Path) -> Callable[[int, int], None]:
-    """What says every second how far the checker is."""
-    last = time.monotonic()
-
-    def progress(done: int, of: int) -> None:
-        nonlocal last
-        if time.monotonic() - last >= 1:
-            last = time.monotonic()
-            console.progress(Progress(done, of, f"checking {file}  interval {done}/{of}"))
-
-    return progress
 
 
 def _experiments(folder: Path) -> list[Experiment]:

@@ -39,7 +39,9 @@ def study(
     make_folder(folder)
     journal = Journal(folder / POINTS)
     measured = {
-        _place(point): point for point in journal.lines if point.items() >= mark.items() and "failed" not in point
+        (point["population"], point["devices"]): point
+        for point in journal.lines
+        if point.items() >= mark.items() and "failed" not in point
     }
     grid = [(population, count) for population in sorted(set(populations)) for count in sorted(set(devices))]
     clock = Clock()
@@ -61,10 +63,6 @@ def study(
     console.message(f"{folder / TABLE}, {', '.join(path.name for path in pictures)}")
 
 
-def _place(point: Point) -> tuple[int, int]:
-    return point["population"], point["devices"]
-
-
 def _measured(path: Path, population: int, devices: int, repeats: int) -> dict[str, Any]:
     """The point, or what it failed by."""
     words = [str(word) for word in (path, population, devices, repeats)]
@@ -73,9 +71,9 @@ def _measured(path: Path, population: int, devices: int, repeats: int) -> dict[s
     )
     if done.returncode == 0:
         return json.loads(done.stdout.splitlines()[-1])
-    told = done.stderr.strip().splitlines()
+    errors = done.stderr.strip().splitlines()
     exhausted = done.returncode == _KILLED or any(word in done.stderr for word in _MEMORY_WORDS)
-    why = OUT_OF_MEMORY if exhausted else (told[-1] if told else f"exit code {done.returncode}")
+    why = OUT_OF_MEMORY if exhausted else (errors[-1] if errors else f"exit code {done.returncode}")
     return {"population": population, "devices": devices, "failed": why}
 
 
@@ -116,11 +114,11 @@ def row_of(point: Point) -> dict[str, Any]:
 def efficiencies(rows: Sequence[Point]) -> dict[tuple[int, int], float]:
     """Strong scaling: rate over that of the fewest devices at the same population, by the ratio of the devices."""
     rates = {(row["population"], row["devices"]): row["candidates_per_s"] for row in rows if not row["failed"]}
-    found = {}
+    shares = {}
     for (population, devices), rate in rates.items():
         fewest = min(count for size, count in rates if size == population)
-        found[population, devices] = rate / rates[population, fewest] * fewest / devices
-    return found
+        shares[population, devices] = rate / rates[population, fewest] * fewest / devices
+    return shares
 
 
 def _sentence(point: Point) -> str:

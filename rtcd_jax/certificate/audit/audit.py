@@ -19,7 +19,7 @@ from rtcd_jax.elite.elite import Elite
 from rtcd_jax.elite.simulators import CLOSED_FORMS
 from rtcd_jax.system.console import Console, table
 from rtcd_jax.system.errors import UserError
-from rtcd_jax.system.files import make_folder, replace_json
+from rtcd_jax.system.files import make_folder, replace_json, require_own_folder
 
 STEPS = 50
 """Runge-Kutta steps of an interval."""
@@ -78,9 +78,7 @@ def audit_funnel(external: ExternalFunnel, cost: Cost, states: int, seed: int, o
     """
     given, misfits = with_fitting_inputs(external)
     config = config_of(given, cost)
-    foreign = sorted(item.name for item in out.iterdir()) if out.is_dir() and not (out / RECORD).is_file() else []
-    if foreign:
-        raise UserError(f"--out = {out}: must be a new or empty folder, or a former audit's: it has {foreign[0]}")
+    require_own_folder(out, "an audit", (out / RECORD).is_file())
     make_folder(out)
     try:
         result = escapes(Elite.of(*elite_of(given, cost)), states, seed)

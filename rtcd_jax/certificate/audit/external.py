@@ -16,7 +16,7 @@ from jaxtyping import Float
 from rtcd_jax.certificate.check import PLANTS, Plant
 from rtcd_jax.certificate.prove.closed_loop import linear
 from rtcd_jax.elite.elite import CLAIMED
-from rtcd_jax.system.delimited import number_in, read_table, shown
+from rtcd_jax.system.delimited import number_or_nan, read_table, shown
 from rtcd_jax.system.errors import UserError, closest, printable
 
 EVEN = 1e-6
@@ -133,7 +133,7 @@ def _matrix(path: Path, what: str, last: int | None = None) -> np.ndarray:
         if len(cells) != width:
             raise UserError(f"{path}, line {line} has {len(cells)} cells, the first row {width}: must be {what}")
         for place, cell in enumerate(cells):
-            value = _number(cell)
+            value = number_or_nan(cell)
             numbers[k, place] = value
             if not abs(value) <= LARGEST and not (k == len(rows) - 1 and place == last and not cell.strip("naNA")):
                 raise UserError(
@@ -141,13 +141,6 @@ def _matrix(path: Path, what: str, last: int | None = None) -> np.ndarray:
                     f"{LARGEST:g} in size; the file must be {what}"
                 )
     return numbers
-
-
-def _number(cell: str) -> float:
-    try:
-        return number_in(cell)
-    except ValueError:
-        return math.nan
 
 
 def _levels_and_values(path: Path, knots: int, n: int) -> tuple[np.ndarray, np.ndarray]:

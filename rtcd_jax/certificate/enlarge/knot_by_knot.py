@@ -106,7 +106,7 @@ def taken_over(usual: Loop, free: Loop, until: int) -> Loop:
 def fastest_growth(loop: Loop, k: int, axes: np.ndarray, objective: ShapeObjective, y: np.ndarray) -> np.ndarray | None:
     """W [n n] for the interval k, which ends with the ellipsoid `axes`; None if there is none."""
     pairs = lower_pairs(loop.n)
-    weight = _importance(axes.T @ loop.values[k + 1] @ axes, objective.attraction)
+    weight = importance(axes.T @ loop.values[k + 1] @ axes, objective.attraction)
     cost = np.array([*(weight[i, j] * (1 if i == j else 2) for i, j in pairs), objective.evenness])
     along = products(y, y)
     below = np.column_stack([-along, np.ones(len(along))])  # the last unknown is max y'W y
@@ -132,7 +132,7 @@ def fastest_growth(loop: Loop, k: int, axes: np.ndarray, objective: ShapeObjecti
     return w
 
 
-def _importance(g: np.ndarray, attraction: float) -> np.ndarray:
+def importance(g: np.ndarray, attraction: float) -> np.ndarray:
     """G^-attraction, its trace n."""
     values, vectors = np.linalg.eigh(g)
     weights = values**-attraction

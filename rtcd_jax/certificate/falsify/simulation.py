@@ -117,7 +117,7 @@ class Motions:
             before, after = np.searchsorted(places, (place, place + 1))
             fraction = random.uniform(interval.start, interval.end)
             x[:, before:after] = (
-                self._nominal(interval.knot, fraction)[:, None] + interval.axes(fraction) @ y[:, before:after]
+                self.nominal(interval.knot, fraction)[:, None] + interval.axes(fraction) @ y[:, before:after]
             )
             flight.again[:] = np.where(np.arange(0, count, REPEATED) >= before, x[:, ::REPEATED], flight.again)
             self._through(interval, interval.start, flight, slice(0, before), steps)
@@ -132,13 +132,13 @@ class Motions:
         again = slice(-(-who.start // REPEATED), -(-who.stop // REPEATED))
         fractions = np.linspace(start, interval.end, steps + 1)
         step = (fractions[1] - fractions[0]) * self.dt
-        law = self._tracking(interval.knot)
+        law = self.tracking(interval.knot)
         for fraction, ahead in itertools.pairwise(fractions):
             t = fraction * self.dt
-            flight.x[:, who] = self._steps(law, t, step, flight.x[:, who], 1)
-            flight.again[:, again] = self._steps(law, t, step, flight.again[:, again], 2)
+            flight.x[:, who] = self.advanced(law, t, step, flight.x[:, who], 1)
+            flight.again[:, again] = self.advanced(law, t, step, flight.again[:, again], 2)
             inward = np.linalg.inv(interval.axes(ahead))
-            flight.measure(self._nominal(interval.knot, ahead), inward, who, again)
+            flight.measure(self.nominal(interval.knot, ahead), inward, who, again)
 
     def _settle(self, flight: "_Flight", steps: int) -> tuple[np.ndarray, np.ndarray]:
         """Whether every motion arrives, and the largest growth of |y| in one step."""
@@ -148,7 +148,7 @@ class Motions:
         for _ in range(round(LONGEST / TOGETHER)):
             x, level = flight.x[:, moving], self._goal_level(flight.x[:, moving])
             for i in range(round(TOGETHER / step)):
-                x = self._steps(self._holding, i * step, step, x, 1)
+                x = self.advanced(self._holding, i * step, step, x, 1)
                 now = self._goal_level(x)
                 growth[moving] = np.maximum(growth[moving], now - level)
                 level = now
@@ -163,16 +163,18 @@ class Motions:
     def _goal_level(self, x: np.ndarray) -> np.ndarray:
         return np.linalg.norm(self._outward @ (x - self._goal[:, None]), axis=0)
 
-    def _nominal(self, k: int, t: float) -> np.ndarray:
+    def nominal(self, k: int, t: float) -> np.ndarray:
         """x* at a fraction of an interval: the cubic Hermite interpolant."""
         a, b, va, vb = self._x[k], self._x[k + 1], self._rates[k][0] * self.dt, self._rates[k][1] * self.dt
         return a + t * (va + t * (3 * (b - a) - 2 * va - vb + t * (2 * (a - b) + va + vb)))
 
-    def _tracking(self, k: int) -> Input:
+    def tracking(self, k: int) -> Input:
+        """The controller's law on interval k, before it is clipped."""
+
         def u(t: float, x: np.ndarray) -> np.ndarray:
             fraction = t / self.dt
             gain = self._gains[k] + fraction * (self._gains[k + 1] - self._gains[k])
-            return self._u[k] - gain @ (x - self._nominal(k, fraction)[:, None])
+            return self._u[k] - gain @ (x - self.nominal(k, fraction)[:, None])
 
         return u
 
@@ -183,7 +185,7 @@ class Motions:
         u = np.clip(law(t, x), -self.limit, self.limit)
         return np.ascontiguousarray(self._rate(x.T, u[:, None]).T)
 
-    def _steps(self, law: Input, t: float, step: float, x: np.ndarray, parts: int) -> np.ndarray:
+    def advanced(self, law: Input, t: float, step: float, x: np.ndarray, parts: int) -> np.ndarray:
         """The states after one step, taken in `parts` classical Runge-Kutta steps."""
         h = step / parts
         for part in range(parts):

@@ -85,12 +85,12 @@ def test_what_is_borne_at_all_times_ends_below_the_smallest_lost_push(lost, born
     recovered = np.ones((2, 5), bool)
     for cell in lost:
         recovered[cell] = False
-    assert experiments._largest_tolerated(impulses, recovered) == borne
+    assert experiments.largest_tolerated(impulses, recovered) == borne
 
 
 def test_every_trouble_changes_what_it_names_and_nothing_else(robots):
     random = np.random.default_rng(0)
-    plain = experiments._from_start(robots, np.zeros(2, int))
+    plain = experiments.from_start(robots, np.zeros(2, int))
     level = np.array([0.0, 0.01])
     changed = {
         "velocity noise": "velocity_noise", "torque noise": "input_noise", "response time": "lag", "delay": "delay",
@@ -154,8 +154,8 @@ def test_the_score_is_the_mean_of_six_criteria(robots):
 
 
 def test_perturbations_are_the_same_for_both_loops(robots):
-    rollouts = experiments._perturbed(
-        robots, experiments._from_start(robots, np.repeat([0, 1], PROFILES)), np.random.default_rng(1)
+    rollouts = experiments.pulsed(
+        robots, experiments.from_start(robots, np.repeat([0, 1], PROFILES)), np.random.default_rng(1)
     )
     heights = np.asarray(rollouts.heights)
     np.testing.assert_array_equal(heights[..., :PROFILES], heights[..., PROFILES:])

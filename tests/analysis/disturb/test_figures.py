@@ -5,9 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from rtcd_jax.analysis.disturb import figures as disturbance
 from rtcd_jax.analysis.disturb.figures import draw_disturbance
-from rtcd_jax.analysis.report.canvas import blank
 from rtcd_jax.system.errors import UserError
 
 LEVELS = [-0.25, 0.0, 0.25]
@@ -54,22 +52,21 @@ def test_every_record_becomes_a_picture_and_a_print(tmp_path, names):
     assert all(path.stat().st_size > 1000 for path in paths)
 
 
-def test_the_heat_map_has_every_cell_at_its_time_and_impulse():
-    with blank((7, 3)) as figure:
-        disturbance._impulse(figure, records(["initial", "best"])["impulse"])
-        panels = figure.axes
-        assert [axes.get_title() for axes in panels] == ["initial: 67% recovered", "best: 67% recovered"]
-        (mesh,) = panels[0].collections
-        np.testing.assert_array_equal(np.asarray(mesh.get_array()).reshape(3, 2), [[1, 0], [1, 1], [0, 1]])
-        assert panels[0].get_ylabel() == "impulse [N m s]"
+def test_the_heat_map_has_every_cell_at_its_time_and_impulse(tmp_path, figures):
+    draw_disturbance(folder_of(tmp_path, ["initial", "best"]))
+    panels = figures[2].axes  # each figure is saved as PNG and as PDF
+    assert [axes.get_title() for axes in panels] == ["initial: 67% recovered", "best: 67% recovered"]
+    (mesh,) = panels[0].collections
+    np.testing.assert_array_equal(np.asarray(mesh.get_array()).reshape(3, 2), [[1, 0], [1, 1], [0, 1]])
+    assert panels[0].get_ylabel() == "impulse [N m s]"
 
 
-def test_strips_say_levels_in_their_unit():
-    with blank((7, 3)) as figure:
-        disturbance._robustness(figure, records(["best"])["robustness"])
-        labels = [[label.get_text() for label in axes.get_xticklabels()] for axes in figure.axes]
-        assert labels == [["-25%", "0%", "+25%"], ["0", "0.05"]]
-        assert [axes.get_title(loc="left") for axes in figure.axes] == ["mass [relative]", "delay [s]"]
+def test_strips_say_levels_in_their_unit(tmp_path, figures):
+    draw_disturbance(folder_of(tmp_path, ["best"]))
+    panels = figures[4].axes
+    labels = [[label.get_text() for label in axes.get_xticklabels()] for axes in panels]
+    assert labels == [["-25%", "0%", "+25%"], ["0", "0.05"]]
+    assert [axes.get_title(loc="left") for axes in panels] == ["mass [relative]", "delay [s]"]
 
 
 def test_a_record_that_is_not_there_or_damaged_is_named(tmp_path):
