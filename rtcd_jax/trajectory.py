@@ -18,7 +18,7 @@ from jaxtyping import Array, DTypeLike, Float
 from rtcd_jax.genome import decode, initial_genome
 from rtcd_jax.numerics import interior_point
 from rtcd_jax.numerics.derivatives import jacobian
-from rtcd_jax.numerics.integrate import componentwise, rk4, split
+from rtcd_jax.numerics.integrate import componentwise, join, rk4, split
 from rtcd_jax.numerics.loops import packed_scan
 from rtcd_jax.problem import Problem
 from rtcd_jax.types import Candidate, Status, Trajectory
@@ -82,7 +82,7 @@ def interval_map(
 ) -> Float[Array, "n *batch"]:
     """Phi(x, u, h), elementwise over the trailing axes."""
     dynamics = componentwise(partial(problem.plant.dynamics, candidate.design))
-    return jnp.stack(rk4(dynamics, split(x), u, h, substeps))
+    return join(rk4(dynamics, split(x), u, h, substeps))
 
 
 def _running(problem: Problem, x, u, candidate: Candidate):

@@ -1,15 +1,18 @@
 """The KKT system of a trajectory optimization step, solved by one Riccati sweep.
 
-    minimize   sum_k  1/2 w_k' H_k w_k + g_k' w_k  +  1/2 curvature dh^2 + slope dh,     w_k = (dx_k, dh, du_k)
-    subject to dx_{k+1} = J_k w_k + c_k,   dx_0 = 0,   dx_N = 0
+    minimize   sum_k  1/2 w_k' H_k w_k + g_k' w_k  +  1/2 curvature dh^2 + slope dh  +  1/2 sum_i end_i dx_N,i^2
+    subject to dx_{k+1} = J_k w_k + c_k,   dx_0 = 0,   dx_N = 0,                         w_k = (dx_k, dh, du_k)
 
 The step length dh is one unknown shared by all intervals: it rides along as a constant state. The pinned
 end enters through its multiplier nu, which the sweep carries as a parameter: the cost-to-go from knot k is
 
     V_k(y, nu) = 1/2 y' P y + p' y + nu' (E y + e) - 1/2 nu' W nu,          y = (dx, dh)
 
-so that hard end states need no penalty: two small solves at knot 0 give dh and nu. All matrices are lists of entries
-[N P], see entries.py: numbers known beforehand, such as a zero slope, are never computed with.
+so that hard end states need no penalty: two small solves at knot 0 give dh and nu. The term of `end` is zero on the
+pinned end and changes neither the step nor the multipliers, but the pivots: without it they are positive only if the
+problem with a *free* end is convex; with large weights, if and only if that with the pinned end is (Debreu,
+Econometrica 20, 1952). All matrices are lists of entries [N P], see entries.py: numbers known beforehand, such as a
+zero slope, are never computed with.
 """
 
 from typing import NamedTuple
@@ -35,6 +38,7 @@ class Subproblem(NamedTuple):
     defects: Float[Array, "N n P"]
     curvature: Float[Array, " P"]
     slope: Float[Array, " P"]
+    end: Float[Array, "n P"]
 
 
 class Step(NamedTuple):
@@ -62,12 +66,14 @@ def solve(problem: Subproblem, floor: float = 1e-12) -> Step:
     """Solve the KKT system in O(N); pivots at or below `floor` clear the flag `convex`."""
     n, batch = problem.defects.shape[1:]
     dtype = problem.defects.dtype
-    zero, one = jnp.zeros((batch,), dtype), jnp.ones((batch,), dtype)
-    identity: Matrix = [[one if i == j else zero for j in range(n + 1)] for i in range(n)]
+    zero = jnp.zeros((batch,), dtype)
+    # Pinned in units of the weights: W is then of size one.
+    units = jnp.sqrt(jnp.where(problem.end > 0, problem.end, 1.0))
+    pinned: Matrix = [[units[i] if i == j else zero for j in range(n + 1)] for i in range(n)]
     last = _Value(
-        quadratic=[[zero] * (i + 1) for i in range(n + 1)],
+        quadratic=[[problem.end[i] if i == j < n else zero for j in range(i + 1)] for i in range(n + 1)],
         linear=[zero] * (n + 1),
-        end=identity,
+        end=pinned,
         end_offset=[zero] * n,
         end_curvature=[[zero] * (i + 1) for i in range(n)],
         convex=jnp.ones((batch,), bool),
@@ -102,8 +108,8 @@ def solve(problem: Subproblem, floor: float = 1e-12) -> Step:
         plus(dot(row, [*dxs, dh]), p, dot(column, nu))
         for row, p, column in zip(rows, slopes, zip(*ends, strict=True), strict=True)
     ]
-    pinned = jnp.pad(jnp.stack(dxs, 1)[:-1], ((1, 1), (0, 0), (0, 0)))
-    return Step(pinned, jnp.stack(dus, 1), dh, jnp.stack(multipliers, 1), convex)
+    exact = jnp.pad(jnp.stack(dxs, 1)[:-1], ((1, 1), (0, 0), (0, 0)))
+    return Step(exact, jnp.stack(dus, 1), dh, jnp.stack(multipliers, 1), convex)
 
 
 def _eliminate_input(value: _Value, hessian, gradient, jacobian, defect, floor):

@@ -1,10 +1,12 @@
 """The Runge-Kutta step against closed forms."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from rtcd_jax.numerics.integrate import rk4, rk4_step
+from rtcd_jax.numerics.integrate import join, rk4, rk4_step, split
+from rtcd_jax.numerics.loops import compiled_for
 
 
 def test_a_step_of_a_linear_system_is_the_exponentials_series_to_fourth_order():
@@ -54,3 +56,11 @@ def test_trailing_axes_are_so_many_trajectories():
 @pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
 def test_dtype_is_kept(dtype):
     assert rk4(lambda x, u: x + u, jnp.ones(2, dtype), jnp.ones(2, dtype), 0.1, 3).dtype == dtype
+
+
+@pytest.mark.parametrize("platform", ["cpu", "cuda"])
+def test_components_are_joined_as_they_were_split(platform):
+    x = np.arange(24.0).reshape(3, 2, 4)
+    with compiled_for(platform):
+        joined = jax.jit(lambda x: join(split(x)))(x)
+    np.testing.assert_array_equal(joined, x)

@@ -23,6 +23,7 @@ class Dense(NamedTuple):
     defects: np.ndarray
     curvature: np.ndarray
     slope: np.ndarray
+    end: np.ndarray
 
 
 def entries(array):
@@ -33,10 +34,10 @@ def entries(array):
 @jax.jit
 def solve(dense):
     hessian, gradient, jacobian = entries(dense.hessians), entries(dense.gradients), entries(dense.jacobians)
-    return kkt.solve(kkt.Subproblem(hessian, gradient, jacobian, dense.defects, dense.curvature, dense.slope))
+    return kkt.solve(kkt.Subproblem(hessian, gradient, jacobian, *dense[3:]))
 
 
-def random_subproblem(seed=0):
+def random_subproblem(seed=0, P=P):
     random = np.random.default_rng(seed)
     root = random.normal(size=(N, w, w, P))
     return Dense(
@@ -46,6 +47,7 @@ def random_subproblem(seed=0):
         defects=random.normal(size=(N, n, P)),
         curvature=random.uniform(1, 2, P),
         slope=random.normal(size=P),
+        end=np.full((n, P), 1e4),
     )
 
 
@@ -118,7 +120,7 @@ def test_known_numbers_are_entries_like_others():
         return float(entry[0, 0]) if np.all(entry == entry[0, 0]) else jnp.asarray(entry)
 
     lists = (jax.tree.map(number, entries(a)) for a in (problem.hessians, problem.gradients, problem.jacobians))
-    structured = kkt.solve(kkt.Subproblem(*lists, problem.defects, problem.curvature, problem.slope))
+    structured = kkt.solve(kkt.Subproblem(*lists, *problem[3:]))
     for ours, theirs in zip(structured, solve(problem), strict=True):
         np.testing.assert_allclose(ours, theirs, rtol=1e-9, atol=1e-10)
 
@@ -148,6 +150,43 @@ def test_the_flag_says_convex_on_one_side_of_singular_only(nudge):
         assert np.sign(smallest) == np.sign(nudge)
     step = solve(problem._replace(curvature=problem.curvature + critical + nudge))
     np.testing.assert_array_equal(step.convex, nudge > 0)
+
+
+def indefinite_stages(shift, count=64):
+    """Curvature is taken off all stages alike: some of the problems stay convex on the constraints' null space."""
+    problem = random_subproblem(P=count)
+    return problem._replace(
+        hessians=problem.hessians - shift * np.eye(w)[:, :, None],
+        jacobians=0.3 * problem.jacobians + np.eye(w)[:n, :, None],
+    )
+
+
+@pytest.mark.parametrize(("shift", "units"), [(0.6, 1.0), (1.0, 1.0), (1.5, 1.0), (1.0, 1e3)])
+def test_the_flag_is_that_of_the_pinned_end_where_stages_are_indefinite(shift, units):
+    """Also in other units of the first state."""
+    problem = indefinite_stages(shift)
+    convex = []
+    for p in range(64):
+        hessian, _, constraints, _ = dense(problem, p)
+        basis = scipy.linalg.null_space(constraints)
+        convex.append(np.linalg.eigvalsh(basis.T @ hessian @ basis)[0] > 0)
+    assert 0 < np.sum(convex) < 64
+    here = np.r_[units, np.ones(w - 1)]
+    scaled = problem._replace(
+        hessians=problem.hessians / here[:, None, None] / here[:, None],
+        gradients=problem.gradients / here[:, None],
+        jacobians=problem.jacobians * here[:n, None, None] / here[:, None],
+        defects=problem.defects * here[:n, None],
+        end=problem.end / here[:n, None] ** 2,
+    )
+    np.testing.assert_array_equal(solve(scaled).convex, convex)
+
+
+@pytest.mark.parametrize("weight", [0.0, 1.0, 1e6])
+def test_the_weights_of_the_pinned_end_change_no_step(weight):
+    problem = random_subproblem()
+    for ours, theirs in zip(solve(problem._replace(end=np.full((n, P), weight))), solve(problem), strict=True):
+        np.testing.assert_allclose(ours, theirs, rtol=1e-6, atol=1e-8)
 
 
 def test_the_flag_falls_where_one_stage_is_concave_in_its_input():

@@ -69,7 +69,7 @@ def test_the_kkt_sweep_of_a_gpu_solves_the_same_system(monkeypatch):
 
     def solve(dense):
         hessian, gradient, jacobian = entries(dense.hessians), entries(dense.gradients), entries(dense.jacobians)
-        return kkt.solve(kkt.Subproblem(hessian, gradient, jacobian, dense.defects, dense.curvature, dense.slope))
+        return kkt.solve(kkt.Subproblem(hessian, gradient, jacobian, *dense[3:]))
 
     expected = jax.jit(solve)(dense)
     with compiled_for("cuda"):

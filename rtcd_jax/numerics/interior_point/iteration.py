@@ -133,7 +133,16 @@ class Iteration:
             curvature, by_step = stiffness.h[0] + it.regularization * self.model.step_scaling, force.h[0]
         else:  # a fixed step is one that no slope moves
             curvature, by_step = jnp.full_like(it.h, jnp.inf), jnp.zeros_like(it.h)
-        return kkt.Subproblem(hessian, gradient, expansion.jacobian, it.defects, curvature, by_step)
+        end = self.end_weights(it, expansion)
+        return kkt.Subproblem(hessian, gradient, expansion.jacobian, it.defects, curvature, by_step, end)
+
+    def end_weights(self, it: Iterate, expansion: Expansion) -> Float[Array, "n P"]:
+        """Those of the pinned end's flag: large beside the model's curvature, in units of the boxes."""
+        n = self.model.n
+        scaling = jnp.asarray(self.model.scaling, self.model.dtype)[:, None]
+        diagonal = self.model.stacked([row[i] for i, row in enumerate(expansion.hessian)], it.us, it.h)
+        sizes = jnp.abs(jnp.delete(diagonal, n, 1)) / jnp.delete(scaling, n, 0)
+        return self.settings.end_weight * (1 + largest(sizes)) * scaling[:n]
 
     def move(self, it: Iterate, slacks: Boxed, subproblem: kkt.Subproblem, parameters: PyTree) -> Iterate:
         """Newton step, fraction to the boundary, filter line search, new regularization."""

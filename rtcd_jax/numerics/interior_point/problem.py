@@ -22,6 +22,7 @@ class Settings(NamedTuple):
     boundary_fraction: float = 0.99  # tau_min, (8)
     regularization_start: float = 1.0
     regularization_factor: float = 4.0
+    end_weight: float = 1e4  # over the model's curvature: see kkt.py
     trials: int = 3  # few: a lane that backtracks keeps the others waiting, more regularization helps as well
     backtracking: float = 0.4
     filter_size: int = 16
