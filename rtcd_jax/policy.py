@@ -26,7 +26,7 @@ from rtcd_jax.problem import Problem
 from rtcd_jax.types import Candidate, Policy, Status, Trajectory, first_failure
 
 DOUBLINGS = 8
-"""2^8 short intervals a substep resolve a closed loop of 1000 poles a second at h = 0.1 s."""
+"""At most 2^8 short intervals a substep resolve a closed loop of 1000 poles a second at h = 0.1 s."""
 
 
 class Nominal(NamedTuple):
@@ -121,7 +121,8 @@ def input_weights(problem: Problem, candidate: Candidate, us: Float[Array, "m *b
 def _interval(problem: Problem, candidate: Candidate, xs, us, weights, duration) -> riccati.Interval:
     a, b = _discounted(problem, candidate, *linearize(problem, candidate, xs, us))
     cost = jnp.broadcast_to(jnp.diag(candidate.q)[:, :, None, None], a.shape)
-    return riccati.constant_interval(a, _spread(b, weights), cost, duration, DOUBLINGS)
+    system = a, _spread(b, weights), cost, duration
+    return riccati.constant_interval(*system, riccati.enough_doublings(*system, DOUBLINGS))
 
 
 def _discounted(problem: Problem, candidate: Candidate, a, b):

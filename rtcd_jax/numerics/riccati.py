@@ -17,9 +17,12 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, ArrayLike, Bool, Float
+from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 from rtcd_jax.numerics.batched import cholesky, mm, mtm, solve_lower, transpose
+
+SHORT = 1 / 32
+"""Duration of a short interval over the time constant of the fastest mode: its third-order series is off by 5e-6."""
 
 
 class Interval(NamedTuple):
@@ -104,13 +107,31 @@ def constant_interval(
     spread: Float[Array, "n n *batch"],
     cost: Float[Array, "n n *batch"],
     duration: Float[ArrayLike, "*#batch"],
-    doublings: int,
+    doublings: Int[Array, ""] | int,
 ) -> Interval:
     """The flow of constant A, G, Q over `duration`, from 2^doublings equal short intervals."""
-    return _double(short_interval(a, spread, cost, duration / 2**doublings), doublings)
+    return _double(short_interval(a, spread, cost, duration / 2.0**doublings), doublings)
 
 
-def _double(interval: Interval, times: int) -> Interval:
+def enough_doublings(
+    a: Float[Array, "n n *batch"],
+    spread: Float[Array, "n n *batch"],
+    cost: Float[Array, "n n *batch"],
+    duration: Float[ArrayLike, "*#batch"],
+    most: int,
+) -> Int[Array, ""]:
+    """Doublings of `constant_interval` with which the fastest mode of the whole batch is resolved, `most` at most."""
+    wanted = jnp.ceil(jnp.log2(jnp.max(_fastest(a, spread, cost) * duration) / SHORT))
+    return jnp.where(jnp.isfinite(wanted), jnp.clip(wanted, 0, most), most).astype(int)
+
+
+def _fastest(a, spread, cost):
+    """A bound of the rates of the Hamiltonian system, in which A is |A|, and G and Q are sqrt(|G| |Q|)."""
+    norm = jnp.sqrt(jnp.sum(spread**2, (0, 1)) * jnp.sum(cost**2, (0, 1))) ** 0.5
+    return norm + jnp.sqrt(jnp.sum(a**2, (0, 1)))
+
+
+def _double(interval: Interval, times: Int[Array, ""] | int) -> Interval:
     return jax.lax.fori_loop(0, times, lambda _, interval: compose(interval, interval), interval)
 
 
@@ -124,9 +145,7 @@ def infinite_horizon(
 
     The horizon doubles until further time changes nothing: convergence is quadratic for stabilizable (A, B), Q > 0.
     """
-    norm = jnp.sqrt(jnp.sum(spread**2, (0, 1)) * jnp.sum(cost**2, (0, 1))) ** 0.5
-    fastest = norm + jnp.sqrt(jnp.sum(a**2, (0, 1)))
-    interval = short_interval(a, spread, cost, 2e-4 / fastest)
+    interval = short_interval(a, spread, cost, 2e-4 / _fastest(a, spread, cost))
     interval = _double(interval, doublings)
     value = interval.cost
     residual = mtm(a, value) + mm(value, a) - mm(value, mm(spread, value)) + cost

@@ -24,6 +24,11 @@ def constant_interval(a, spread, cost, duration, doublings=8):
     return riccati.constant_interval(a, spread, cost, duration, doublings)
 
 
+@partial(jax.jit, static_argnums=4)
+def enough_doublings(a, spread, cost, duration, most):
+    return riccati.enough_doublings(a, spread, cost, duration, most)
+
+
 def random_systems(n, m, r):
     """A [n n P], B [n m P], G = B B' / r and a diagonal Q."""
     random = np.random.default_rng([n, m])
@@ -89,6 +94,26 @@ def test_an_interval_is_the_hamiltonians_exponential(n, m, r):
         exact = exact_interval(a[..., p], spread[..., p], cost[..., p], 0.02)
         for ours, theirs in zip(interval[:3], exact, strict=True):
             assert_close_matrices(ours[..., p], theirs, 2e-7)
+
+
+@pytest.mark.parametrize(("n", "m", "r"), SIZES)
+@pytest.mark.parametrize("duration", [1e-5, 2e-3, 0.02])
+def test_enough_doublings_are_as_exact_at_every_duration(n, m, r, duration):
+    a, _, spread, cost = random_systems(n, m, r)
+    doublings = enough_doublings(a, spread, cost, duration, 20)
+    interval = constant_interval(a, spread, cost, duration, int(doublings))
+    for p in range(SYSTEMS):
+        exact = exact_interval(a[..., p], spread[..., p], cost[..., p], duration)
+        for ours, theirs in zip(interval[:3], exact, strict=True):
+            assert_close_matrices(ours[..., p], theirs, 2e-5)
+
+
+def test_doublings_grow_with_the_duration_up_to_the_most():
+    a, _, spread, cost = random_systems(4, 2, 1.0)
+    counts = [int(enough_doublings(a, spread, cost, duration, 8)) for duration in (1e-9, 1e-3, 2e-3, 1e9, np.nan)]
+    assert counts[0] == 0
+    assert counts[2] == counts[1] + 1
+    assert counts[3:] == [8, 8]
 
 
 def test_a_short_interval_is_right_to_third_order():
