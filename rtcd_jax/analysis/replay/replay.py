@@ -15,8 +15,8 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from rtcd_jax.analysis.replay.measured import Measured, jumps, read_measured, unwrapped
-from rtcd_jax.analysis.report.canvas import BLACK, GRAY, LIGHT, WIDTH, blank, written
-from rtcd_jax.analysis.report.funnels import draw_shadows, frame, told_once, window
+from rtcd_jax.analysis.report.canvas import BLACK, GRAY, LIGHT, WIDTH, blank, shared_legend, written
+from rtcd_jax.analysis.report.funnels import draw_shadows, frame, window
 from rtcd_jax.analysis.report.reading import BLUE, VERMILION, FunnelView
 from rtcd_jax.analysis.report.shapes import planes
 from rtcd_jax.config.load import Config
@@ -184,7 +184,7 @@ def _draw(config: Config, funnel: FunnelView, replay: Replay, folder: Path, name
             low, high = window([funnel], plane)
             view = np.stack([np.minimum(low, motion.min(0)), np.maximum(high, motion.max(0))])
             frame(axes, config, plane, view)
-        figure.legend(**told_once(panels), loc="outside upper center")
+        figure.legend(**shared_legend(panels), loc="outside upper center")
         ratio.semilogy(replay.measured.time, np.maximum(replay.ratio, LEAST), color=BLUE)
         ratio.axhline(1, color=BLACK, lw=1, ls="--")
         ratio.axvline(float(funnel.elite.time[-1]), color=GRAY, lw=1, ls=":")

@@ -1,9 +1,11 @@
 """Run folder -> figures, tables, one HTML page. Reads what a run has stored, and needs no JAX.
 
 reading.py, history.py     the folder's content, and the course of its search
-funnels.py, progress.py    figures/NAME.png and .pdf
-plots.py, tables.py        what the page shows
-page.py                    report.html
+charts.py                  what a figure shows: panels of curves, bands and shares
+funnels.py, progress.py    the figures of funnels and of a search
+canvas.py                  charts in print, figures/NAME.png and .pdf
+traces.py, plots.py        charts and funnels on the page, by plotly.js
+tables.py, page.py         the page's tables, report.html
 """
 
 from rtcd_jax.analysis.report.page import refresh, report

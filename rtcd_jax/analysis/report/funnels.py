@@ -1,13 +1,15 @@
 """Print figures of funnels: side by side in time's colors, over one another, and their levels over time."""
 
-from collections.abc import Mapping, Sequence
+import functools
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from jaxtyping import Float
 
-from rtcd_jax.analysis.report.canvas import BLACK, GRAY, LIGHT, SMALL, WIDTH, blank, written
+from rtcd_jax.analysis.report.canvas import BLACK, GRAY, SMALL, WIDTH, blank, draw_panel, shared_legend, written
+from rtcd_jax.analysis.report.charts import Chart, Curve, Panel
 from rtcd_jax.analysis.report.reading import FunnelView, Run, funnel_views
 from rtcd_jax.analysis.report.shapes import outlines, planes, projections
 from rtcd_jax.analysis.report.words import guarantee, listed, quantity, volume_unit, words
@@ -37,20 +39,22 @@ def draw_funnels(run: Run) -> list[Path]:
         return written(figure, run.figures, "funnel")
 
 
-def draw_levels(run: Run) -> list[Path]:
-    """Draws rho and the volume of every knot over time; the files written. UserError as `draw_funnels`."""
-    with blank((WIDTH, 4.6)) as figure:
-        levels, volumes = figure.subplots(2, 1, sharex=True)
-        for funnel in run.funnels:
-            elite = funnel.elite
-            for axes, values in ((levels, elite.rho), (volumes, elite.volumes_per_knot)):
-                axes.semilogy(elite.time, values, ".-", ms=4, color=funnel.color, label=funnel.label)
-        levels.set_ylabel("level ρ of V [-]")
-        volumes.set(xlabel="time [s]", ylabel=f"volume [{volume_unit(run.config)}]")
-        for axes in (levels, volumes):
-            axes.grid(axis="y", lw=0.4, color=LIGHT)
-        figure.legend(handles=levels.lines, title=guarantee(run.best.record), ncols=2, loc="outside upper center")
-        return written(figure, run.figures, "levels")
+def levels(config: Config, funnels: Sequence[FunnelView], note: str = "") -> Chart:
+    """rho and the volume of every knot over time."""
+    rho = [Curve(funnel.elite.time, funnel.elite.rho, funnel.label, funnel.color, style="marked") for funnel in funnels]
+    panels = [Panel("level ρ of V [-]", rho, logarithmic=True), volumes(config, funnels)]
+    return Chart("Levels and volumes", "time [s]", panels, 4.6, note)
+
+
+def volumes(
+    config: Config, funnels: Sequence[FunnelView], label: Callable[[FunnelView], str] = lambda funnel: funnel.label
+) -> Panel:
+    """The volume of every knot's ellipsoid over time."""
+    curves = [
+        Curve(funnel.elite.time, funnel.elite.volumes_per_knot, label(funnel), funnel.color, style="marked")
+        for funnel in funnels
+    ]
+    return Panel(f"volume of a knot's\nellipsoid [{volume_unit(config)}]", curves, logarithmic=True)
 
 
 def draw_over(runs: Sequence[Run], folder: Path, name: str) -> list[Path]:
@@ -60,18 +64,15 @@ def draw_over(runs: Sequence[Run], folder: Path, name: str) -> list[Path]:
     """
     config, funnels, pairs = runs[0].config, funnel_views(runs), planes(runs[0].best.x.shape[1])
     with blank((WIDTH, 3.4 * len(pairs) + 2.6)) as figure:
-        *panels, volumes = figure.subplots(len(pairs) + 1, 1, height_ratios=[3.4] * len(pairs) + [2.0])
+        *panels, below = figure.subplots(len(pairs) + 1, 1, height_ratios=[3.4] * len(pairs) + [2.0])
         for axes, plane in zip(panels, pairs, strict=True):
             draw_shadows(axes, funnels, plane)
             frame(axes, config, plane, window(funnels, plane))
-        figure.legend(**told_once(panels), loc="outside upper center")
-        for funnel in funnels:
-            time, values = funnel.elite.time, funnel.elite.volumes_per_knot
-            volumes.semilogy(time, values, color=funnel.color, label=_short_label(funnel))
-        volumes.set(xlabel="time [s]", ylabel=f"volume of a knot's\nellipsoid [{volume_unit(config)}]")
-        volumes.grid(axis="y", lw=0.4, color=LIGHT)
+        figure.legend(**shared_legend(panels), loc="outside upper center")
+        draw_panel(below, volumes(config, funnels, _short_label))
+        below.set_xlabel("time [s]")
         units = f"volumes in {volume_unit(config)}, integrals in {volume_unit(config, 'integral')}"
-        figure.legend(handles=volumes.lines, title=units, title_fontsize=SMALL, loc="outside lower center")
+        figure.legend(handles=below.lines, title=units, title_fontsize=SMALL, loc="outside lower center")
         return written(figure, folder, name)
 
 
@@ -118,7 +119,8 @@ def frame(axes: "Axes", config: Config, plane: tuple[int, int], view: Float[np.n
     ):
         position = [[point[i]] for i in plane]
         axes.plot(*position, marker, mfc=fill, mec=BLACK, ms=9, ls="none", label=name, zorder=4)
-    _draw_limits(axes, [config.task.state_limits[i] for i in plane], view)
+    for axis, value in visible_limits(config, plane, view):
+        (axes.axvline, axes.axhline)[axis](value, color=GRAY, ls="--", lw=1, label="state limit")
     axes.set(xlim=view[:, 0], ylim=view[:, 1])
     states = list(config.plant.states.items())
     axes.set(xlabel=quantity(*states[plane[0]]), ylabel=quantity(*states[plane[1]]))
@@ -139,19 +141,16 @@ def _beside(figure: "Figure", run: Run) -> None:
                 axes.set_title(_title(config, funnel))
             panels.append(axes)
     figure.colorbar(colors, ax=panels, label="time [s]", pad=0.02, aspect=30 * len(pairs))
-    figure.legend(**told_once(panels), loc="outside upper center", title=run.absence or None)
-    volumes = figure.add_subplot(grid[-1, :])
-    _draw_volumes(volumes, config, funnels)
+    figure.legend(**shared_legend(panels), loc="outside upper center", title=run.absence or None)
+    below = figure.add_subplot(grid[-1, :])
+    draw_panel(below, volumes(config, funnels, functools.partial(_volumes_label, config)))
+    below.set_xlabel("time [s]")
+    if len(funnels) == 2:
+        first, second = (funnel.elite.volumes for funnel in funnels)
+        ratios = [f"{words(name)} × {second[name] / first[name]:.3g}" for name in VOLUMES]
+        below.set_title(f"{funnels[1].label} over {funnels[0].label}: {', '.join(ratios)}")
     # The figure's legend, not the panel's: its width must not squeeze the panels.
-    figure.legend(handles=volumes.lines, loc="outside lower center")
-
-
-def told_once(panels: Sequence["Axes"]) -> dict[str, Any]:
-    """The entries of a legend for all that the panels have in common, in one row where they fit."""
-    entries = (zip(*axes.get_legend_handles_labels(), strict=True) for axes in panels)
-    handles = {label: handle for pairs in entries for handle, label in pairs}
-    columns = len(handles) if len(handles) <= 6 else 4
-    return {"handles": list(handles.values()), "labels": list(handles), "ncols": columns}
+    figure.legend(handles=below.lines, loc="outside lower center")
 
 
 def _time_colors(duration: float) -> "ScalarMappable":
@@ -173,24 +172,14 @@ def _draw_in_time(axes: "Axes", funnel: FunnelView, plane: tuple[int, int], colo
     axes.plot(*funnel.elite.x[:, plane].T, color=BLACK, label="nominal motion")
 
 
-def _draw_limits(axes: "Axes", limits: Sequence[float], view: np.ndarray) -> None:
-    """Dashed lines at the limits on |x_i| that the window shows."""
-    for lines, limit, (low, high) in zip((axes.axvline, axes.axhline), limits, view.T, strict=True):
-        for value in (-limit, limit):
+def visible_limits(
+    config: Config, plane: tuple[int, int], view: Float[np.ndarray, "2 2"]
+) -> Iterator[tuple[int, float]]:
+    """The limits on |x_i| that the window shows: on which of the plane's axes, and where."""
+    for axis, (i, (low, high)) in enumerate(zip(plane, view.T, strict=True)):
+        for value in (-config.task.state_limits[i], config.task.state_limits[i]):
             if low <= value <= high:
-                lines(value, color=GRAY, ls="--", lw=1, label="state limit")
-
-
-def _draw_volumes(axes: "Axes", config: Config, funnels: Sequence[FunnelView]) -> None:
-    for funnel in funnels:
-        time, values = funnel.elite.time, funnel.elite.volumes_per_knot
-        axes.semilogy(time, values, ".-", ms=4, color=funnel.color, label=_volumes_label(config, funnel))
-    axes.set(xlabel="time [s]", ylabel=f"volume of a knot's\nellipsoid [{volume_unit(config)}]")
-    axes.grid(axis="y", lw=0.4, color=LIGHT)
-    if len(funnels) == 2:
-        first, second = funnels
-        ratios = [f"{words(name)} × {second.elite.volumes[name] / first.elite.volumes[name]:.3g}" for name in VOLUMES]
-        axes.set_title(f"{second.label} over {first.label}: {', '.join(ratios)}")
+                yield axis, value
 
 
 def _volumes_label(config: Config, funnel: FunnelView) -> str:

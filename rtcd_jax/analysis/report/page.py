@@ -11,14 +11,16 @@ import json
 from collections.abc import Iterator, Mapping, Sequence
 from importlib import resources
 from pathlib import Path
-from typing import Any
 
 from rtcd_jax.analysis.report import tables
-from rtcd_jax.analysis.report.funnels import draw_funnels, draw_levels, draw_over
-from rtcd_jax.analysis.report.plots import plots
-from rtcd_jax.analysis.report.progress import draw_convergence, draw_courses
-from rtcd_jax.analysis.report.reading import Experiment, Run, compared, read_run
+from rtcd_jax.analysis.report.canvas import print_chart
+from rtcd_jax.analysis.report.charts import Chart
+from rtcd_jax.analysis.report.funnels import draw_funnels, draw_over, levels
+from rtcd_jax.analysis.report.plots import planes_of
+from rtcd_jax.analysis.report.progress import charts
+from rtcd_jax.analysis.report.reading import Experiment, Run, compared, funnel_views, read_run
 from rtcd_jax.analysis.report.tables import Cell, Table
+from rtcd_jax.analysis.report.traces import plots_of
 from rtcd_jax.analysis.report.words import NONE, duration, guarantee, listed, ratio, words
 from rtcd_jax.system.console import Console
 from rtcd_jax.system.errors import UserError
@@ -72,17 +74,21 @@ def refresh(folder: Path, console: Console | None = None) -> Path | None:
 
 def draw_figures(run: Run) -> list[Path]:
     """The figures of one run, NAME.png and .pdf in `run.figures`. Raises UserError if they cannot be written."""
-    over = draw_over([run], run.figures, "overlay")
-    of_search = (draw_courses, draw_convergence) if run.generations else ()
-    return over + [path for draw in (draw_funnels, draw_levels, *of_search) for path in draw(run)]
+    funnels = draw_over([run], run.figures, "overlay") + draw_funnels(run)
+    others = {"levels": levels(run.config, run.funnels, guarantee(run.best.record)), **charts([run])}
+    return funnels + [path for name, chart in others.items() for path in print_chart(chart, run.figures, name)]
 
 
 def render(runs: Sequence[Run]) -> str:
     """The whole page."""
     title = html.escape(" and ".join(run.name for run in runs))
-    figures = plots(runs)
+    views, of_search = funnel_views(runs), charts(runs)
+    funnels = planes_of(runs[0].config, views) | plots_of("levels", levels(runs[0].config, views))
+    figures = dict(funnels)
+    for name, chart in of_search.items():
+        figures |= plots_of(name, chart)
     data = json.dumps(figures, allow_nan=False, separators=(",", ":")).replace("<", "\\u003c")
-    body = "\n".join([_header(runs), *_sections(runs, figures)])
+    body = "\n".join([_header(runs), *_sections(runs, list(funnels), of_search)])
     return (
         f'<!doctype html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n<title>{title}</title>\n'
         f'<meta name="viewport" content="width=device-width, initial-scale=1">\n'
@@ -139,9 +145,8 @@ def _headlines(run: Run) -> Iterator[tuple[str, str, str]]:
         yield "proof", "none", f"certificate {certificate.verdict}"
     else:
         yield "proof", certificate.guarantee, "of the best's funnel"
-    kept = [seen.get("kept") for seen in run.verification.values()]
-    seen = ("not refuted" if all(kept) else "REFUTED") if kept else "none yet"
-    yield "verification", seen, "by independent simulators" if kept else "rtcd verify"
+    verdict = tables.verdict(run)
+    yield "verification", verdict or "none yet", "by independent simulators" if verdict else "rtcd verify"
 
 
 def _gain(run: Run, volume: str) -> float | None:
@@ -153,29 +158,21 @@ def _card(name: str, value: str, remark: str) -> str:
     return f'<div class="card">{"".join(f"<{tag}>{html.escape(text)}</{tag}>" for tag, text in parts)}</div>'
 
 
-def _sections(runs: Sequence[Run], figures: Mapping[str, Any]) -> Iterator[str]:
+def _sections(runs: Sequence[Run], funnels: Sequence[str], of_search: Mapping[str, Chart]) -> Iterator[str]:
     alone = runs[0] if len(runs) == 1 else None
     if alone is None:
         yield _section("Compared", _table(tables.comparison(runs)))
-    yield _section("Funnels", *_funnels(runs, figures))
+    yield _section("Funnels", *_funnels(runs, funnels))
     promise = "" if alone is None else _note(f"The best funnel is {guarantee(alone.best.record)}.")
     advice = (
         "Ratios are optimal over initial. The sum counts knots, most of them near the goal: look at the initial "
         "ellipsoid too, that of the first knot, where disturbances come first; configurations call it the inlet."
     )
     yield _section("Initial and optimal", _table(tables.gains(runs)), promise, _note(advice))
+    for name, chart in of_search.items():
+        yield _section(chart.title, *_charted(name, chart))
     if alone:
-        named = [name for name in figures if name.startswith("course")]
-        boxes = "".join(_plot(name, "small") for name in named)
-        if alone.generations:
-            yield _section(
-                "Search", _plot("convergence", "tall"), _note("Volumes are sampled, as the search saw them.")
-            )
-            yield _section("Design and weights", f'<div class="grid">{boxes}</div>')
         yield _section("Elites", _table(tables.elites(alone)), _note("Click a heading to sort."))
-    else:
-        legend = "Sampled volumes, each search's own objective: solid the best so far, dotted each generation's median."
-        yield _section("Search", _plot("convergence"), _note(legend))
     yield _section("Certificates", *_certified(runs))
     verification = tables.verification(runs)
     yield _section("Verification", _table(verification) if verification else _note("Nothing yet: rtcd verify RUN."))
@@ -186,7 +183,17 @@ def _sections(runs: Sequence[Run], figures: Mapping[str, Any]) -> Iterator[str]:
     yield _section("Provenance", _table(tables.provenance(runs)))
 
 
-def _funnels(runs: Sequence[Run], figures: Mapping[str, Any]) -> Iterator[str]:
+def _charted(name: str, chart: Chart) -> Iterator[str]:
+    """The places of a chart's plots, and its note."""
+    if chart.columns == 1:
+        yield _plot(name, "tall" if len(chart.panels) > 2 else "")
+    else:
+        yield f'<div class="grid">{"".join(_plot(each, "small") for each in plots_of(name, chart))}</div>'
+    if chart.note:
+        yield _note(f"{chart.note[0].upper()}{chart.note[1:]}.")
+
+
+def _funnels(runs: Sequence[Run], names: Sequence[str]) -> Iterator[str]:
     for run in runs:
         if run.absence:
             yield _note(f"{run.name}: {run.absence}" if len(runs) > 1 else f"{run.absence}.")
@@ -194,12 +201,12 @@ def _funnels(runs: Sequence[Run], figures: Mapping[str, Any]) -> Iterator[str]:
         '<label class="moment">ellipsoid at <output>0.00 s</output>'
         '<input type="range" min="0" max="1" step="0.002" value="0" aria-label="time along the motion"></label>'
     )
-    named = [name for name in figures if name.startswith("plane")]
-    yield f'<div class="grid wide">{"".join(_plot(name) for name in named)}</div>'
+    *planes, levels = names
+    yield f'<div class="grid wide">{"".join(map(_plot, planes))}</div>'
     yield _note(
         "Shadows of every knot's ellipsoid on the plane of a coordinate and its velocity. A click in the legend hides."
     )
-    yield _plot("levels")
+    yield _plot(levels)
 
 
 def _certified(runs: Sequence[Run]) -> Iterator[str]:
@@ -236,14 +243,12 @@ def _note(text: str) -> str:
 
 
 def _table(table: Table) -> str:
-    columns = zip(table.heads, table.numeric, strict=True)
-    heads = "".join(_head(head, numeric) for head, numeric in columns)
+    heads = "".join(
+        f'<th scope="col"{_NUMBER * numeric}><button type="button">{html.escape(head)}</button></th>'
+        for head, numeric in zip(table.heads, table.numeric, strict=True)
+    )
     rows = "\n".join(f"<tr>{''.join(map(_cell, row, table.numeric))}</tr>" for row in table.rows)
     return f'<div class="scroll"><table>\n<thead><tr>{heads}</tr></thead>\n<tbody>\n{rows}\n</tbody></table></div>'
-
-
-def _head(text: str, numeric: bool) -> str:
-    return f'<th scope="col"{_NUMBER * numeric}><button type="button">{html.escape(text)}</button></th>'
 
 
 def _cell(value: Cell, numeric: bool) -> str:

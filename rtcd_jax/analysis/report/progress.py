@@ -1,19 +1,14 @@
-"""Print figures of a search: volumes, failures and step size over the generations, and every variable's course."""
+"""Charts of a search: volumes, failures and step size over the generations, every variable's course, compared runs."""
 
-from pathlib import Path
-from typing import TYPE_CHECKING
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from rtcd_jax.analysis.report.canvas import BLACK, GRAY, LIGHT, SMALL, WIDTH, blank, logarithmic, written
-from rtcd_jax.analysis.report.history import QUANTILES, Course, Generations, column, courses, failures, spread
+from rtcd_jax.analysis.report.canvas import BLACK, GRAY
+from rtcd_jax.analysis.report.charts import Band, Chart, Curve, Panel, Shares, Style, more_than_a_decade
+from rtcd_jax.analysis.report.history import QUANTILES, column, courses, failures, spread
 from rtcd_jax.analysis.report.reading import BLUE, VERMILION, Run
 from rtcd_jax.analysis.report.words import volume_unit, words
-from rtcd_jax.config.load import Config
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
 GREEN = "#009E73"
 STATUS_COLORS = {
@@ -24,101 +19,87 @@ STATUS_COLORS = {
     "NOT_FINITE": "#000000",
 }
 SPREAD = f"{QUANTILES[0]} to {QUANTILES[1]} % of the population"
-COLUMNS = 2
+SEARCHES: Mapping[str, tuple[Style, float]] = {"best_so_far": ("solid", 1.8), "median": ("dotted", 1.0)}
+"""What is compared of searches, and how its lines look."""
 
 
-def draw_convergence(run: Run) -> list[Path]:
-    """Draws the volumes, the candidates by status and the step size over the generations; the files written.
-
-    Raises:
-        UserError: a folder that cannot be written.
-    """
-    with blank((WIDTH, 5.8)) as figure:
-        _convergence(figure, run.config, run.generations)
-        return written(figure, run.figures, "convergence")
+def charts(runs: Sequence[Run]) -> dict[str, Chart]:
+    """The charts of one run's search, or of several compared ones, by name; none where nothing was searched."""
+    if len(runs) > 1:
+        return {"convergence": compared_convergence(runs)}
+    return {"convergence": convergence(runs[0]), "courses": variables(runs[0])} if runs[0].generations else {}
 
 
-def draw_courses(run: Run) -> list[Path]:
-    """Draws every searched variable over the generations, in its own unit; the files written.
-
-    Raises:
-        UserError: a folder that cannot be written.
-    """
-    variables = courses(run.config, run.generations)
-    rows = -(-len(variables) // COLUMNS)
-    with blank((WIDTH, 1.9 * rows + 0.4)) as figure:
-        panels = figure.subplots(rows, COLUMNS, sharex=True, squeeze=False).ravel()
-        for axes, course in zip(panels, variables, strict=False):
-            _draw_course(axes, course, column(run.generations, "index"))
-        for axes in panels[len(variables) :]:
-            axes.remove()
-        handles, labels = panels[0].get_legend_handles_labels()
-        figure.legend(handles, labels, loc="outside upper center", ncols=len(labels))
-        figure.supxlabel("generation", fontsize=9)
-        return written(figure, run.figures, "courses")
-
-
-def _convergence(figure: "Figure", config: Config, generations: Generations) -> None:
-    volumes, share, sigma = figure.subplots(3, 1, sharex=True, height_ratios=[3, 1.2, 1])
-    index = column(generations, "index")
+def convergence(run: Run) -> Chart:
+    """Volumes, candidates by status and step size over the generations; restarts are marked."""
+    generations, search = run.generations, run.config.search
+    index, sigma = column(generations, "index"), column(generations, "sigma")
+    best_so_far, best, median = (column(generations, name) for name in ("best_so_far", "best", "median"))
     low, high = spread(generations)
-    volumes.fill_between(index, low, high, color=GREEN, alpha=0.15, lw=0, label=f"{SPREAD} with a funnel")
-    for name, color, style in (("best_so_far", VERMILION, "-"), ("best", BLUE, "."), ("median", GREEN, ".--")):
-        volumes.plot(index, column(generations, name), style, ms=5, color=color, label=words(name))
-    _draw_statuses(share, index, generations)
-    sigma.plot(index, column(generations, "sigma"), ".-", ms=5, color=BLACK)
-    restarts = index[np.diff(column(generations, "restarts"), prepend=0) > 0]
-    for axes in (volumes, share, sigma):
-        axes.grid(axis="y", lw=0.4, color=LIGHT)
-        label = "restart" if restarts.size else "_"
-        axes.vlines(restarts, 0, 1, transform=axes.get_xaxis_transform(), color=GRAY, ls=":", lw=1, label=label)
-    for axes in (volumes, sigma):
-        _wide(axes)
-    search = config.search
-    volumes.set_title(f"{config.plant.name}, {search.mode} search, population {search.population}, seed {search.seed}")
-    volumes.set_ylabel(f"volume ({words(search.objective)}) [{volume_unit(config, search.objective)}]")
-    volumes.legend(title="sampled, as the search saw it", title_fontsize=SMALL)
-    sigma.set(ylabel="step size\n[box widths]", xlabel="generation")
-    _whole_numbers(sigma)
+    marks = [
+        Band(index, low, high, f"{SPREAD} with a funnel", GREEN),
+        Curve(index, best_so_far, "best so far", VERMILION),
+        Curve(index, best, "best", BLUE, style="points"),
+        Curve(index, median, "median", GREEN, style="dashed"),
+    ]
+    label = f"volume ({words(search.objective)}) [{volume_unit(run.config, search.objective)}]"
+    title = f"{run.config.plant.name}, {search.mode} search, population {search.population}, seed {search.seed}"
+    logarithmic = more_than_a_decade(best_so_far, best, median)
+    statuses = {
+        status_words(name): (share, STATUS_COLORS.get(name, GRAY)) for name, share in failures(generations).items()
+    }
+    panels = [
+        Panel(label, marks, title, logarithmic, height=3),
+        Panel("candidates\nby status [-]", [Shares(index, statuses)], window=(0, 1), height=1.2),
+        Panel(
+            "step size σ\n[box widths]",
+            [Curve(index, sigma, "", BLACK, style="marked")],
+            logarithmic=more_than_a_decade(sigma),
+        ),
+    ]
+    restarts = index[np.diff(column(generations, "restarts"), prepend=0) > 0].tolist()
+    note = "sampled, as the search saw it"
+    return Chart("Search", "generation", panels, 5.8, note, events=restarts, event="restart")
 
 
-def _draw_statuses(axes: "Axes", index: np.ndarray, generations: Generations) -> None:
-    """Shares of the candidates by status, one over the other."""
-    shares = failures(generations)
-    below = np.zeros(len(index))
-    for name, share in shares.items():
-        label, color = status_words(name), STATUS_COLORS.get(name, GRAY)
-        axes.fill_between(index, below, below + share, step="mid", lw=0, label=label, color=color)
-        below = below + share
-    axes.set(ylabel="candidates\nby status [-]", ylim=(0, 1.0))
-    axes.legend(loc="lower right", ncols=len(shares), frameon=True, framealpha=0.8, edgecolor="none")
+def variables(run: Run) -> Chart:
+    """Every searched variable over the generations, in its own unit, between the ends of its box."""
+    index, panels = column(run.generations, "index"), []
+    for course in courses(run.config, run.generations):
+        initial = np.full(len(index), course.variable.initial)
+        marks = [
+            Band(index, course.low, course.high, SPREAD, GREEN),
+            Curve(index, course.median, "median", GREEN, style="dashed"),
+            Curve(index, course.best, "best of the generation", VERMILION, style="points"),
+            Curve(index, initial, "initial", BLUE, style="dotted", width=1),
+        ]
+        panels.append(Panel("", marks, course.title, course.logarithmic, course.window))
+    rows = -(-len(panels) // 2)
+    return Chart("Design and weights", "generation", panels, 1.9 * rows + 0.4, columns=2)
+
+
+def compared_convergence(runs: Sequence[Run]) -> Chart:
+    """Several searches over their candidates, each by its own objective: volumes above, feasible shares below."""
+    volumes, feasible = [], []
+    for run in runs:
+        evaluated = column(run.generations, "evaluations")
+        for name, (style, width) in SEARCHES.items():
+            first = name == "best_so_far"
+            label = f"{run.name} ({words(run.config.search.objective)})" if first else f"{run.name}, {words(name)}"
+            values = column(run.generations, name)
+            volumes.append(Curve(evaluated, values, label, run.color, style, width, run.name))
+        label, share = f"{run.name}, feasible", column(run.generations, "feasible")
+        feasible.append(Curve(evaluated, share, label, run.color, width=1.0, group=run.name))
+    units = ", ".join(sorted({volume_unit(run.config, run.config.search.objective) for run in runs}))
+    logarithmic = more_than_a_decade(*(curve.y for curve in volumes))
+    panels = [
+        Panel(f"volume [{units}]", volumes, logarithmic=logarithmic, height=3),
+        Panel("with a funnel [-]", feasible, window=(0, 1.03)),
+    ]
+    note = "sampled, each search's own objective: solid the best so far, dotted each generation's median"
+    return Chart("Search", "candidates", panels, 4.6, note)
 
 
 def status_words(name: str) -> str:
     """A status in words."""
     return "has a funnel" if name == "OK" else words(name).lower()
-
-
-def _draw_course(axes: "Axes", course: Course, index: np.ndarray) -> None:
-    axes.fill_between(index, course.low, course.high, color=GREEN, alpha=0.15, lw=0, label=SPREAD)
-    axes.plot(index, course.median, "--", color=GREEN, label="median")
-    axes.plot(index, course.best, ".", ms=4, color=VERMILION, label="best of the generation")
-    axes.axhline(course.variable.initial, color=BLUE, lw=1, ls=":", label="initial")
-    if course.logarithmic:
-        logarithmic(axes)
-    axes.set(ylim=course.window, title=course.title)
-    _whole_numbers(axes)
-
-
-def _whole_numbers(axes: "Axes") -> None:
-    from matplotlib.ticker import MaxNLocator
-
-    axes.xaxis.set_major_locator(MaxNLocator(integer=True))
-
-
-def _wide(axes: "Axes") -> None:
-    """A logarithmic axis for positive numbers of more than one decade, a linear one for fewer."""
-    numbers = np.concatenate([line.get_ydata() for line in axes.lines])
-    numbers = numbers[np.isfinite(numbers)]
-    if numbers.size and 0 < 10 * numbers.min() < numbers.max():
-        logarithmic(axes)

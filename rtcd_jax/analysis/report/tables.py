@@ -1,7 +1,7 @@
 """Tables of the page: what a run has searched, proved, verified, and where it came from."""
 
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, cast, final
 
@@ -115,21 +115,26 @@ def verification(runs: Sequence[Run]) -> Table | None:
     rows = []
     for run in runs:
         for name, record in run.verification.items():
-            for simulator, seen in record.get("witnesses", {}).items():
-                counts = [seen.get(key) for key in ("left_funnel", "left_limits", "missed_goal")]
-                counts += [seen.get(key) for key in ("rate", "rate_lower", "rate_upper")]
-                promise = [record.get("epsilon"), record.get("confidence"), _refuted(not seen.get("kept"))]
+            for simulator, outcome in record.get("witnesses", {}).items():
+                counts = [outcome.get(key) for key in ("left_funnel", "left_limits", "missed_goal")]
+                counts += [outcome.get(key) for key in ("rate", "rate_lower", "rate_upper")]
+                promise = [record.get("epsilon"), record.get("confidence"), _verdict([outcome.get("kept")])]
                 rows.append((*_run_cell(runs, run), name, simulator, record.get("states"), *counts, *promise))
     return Table(heads, tuple(rows)) if rows else None
 
 
-def _refuted(refuted: bool) -> str:
-    return "REFUTED" if refuted else "not refuted"
+def verdict(run: Run) -> str | None:
+    """Whether the independent simulators refute any of the run's promises; None before `rtcd verify`."""
+    return _verdict(record.get("kept") for record in run.verification.values()) if run.verification else None
 
 
-def experiment(found: Experiment) -> Table:
+def _verdict(not_refuted: Iterable[Any]) -> str:
+    return "not refuted" if all(not_refuted) else "REFUTED"
+
+
+def experiment(record: Experiment) -> Table:
     """An experiment's summary: a row for each of its mappings, or else one for each of its numbers."""
-    summary = found.summary
+    summary = record.summary
     if summary and all(isinstance(value, Mapping) for value in summary.values()):
         heads = tuple(dict.fromkeys(key for value in summary.values() for key in value))
         rows = tuple((words(name), *(_cell(value.get(key)) for key in heads)) for name, value in summary.items())
@@ -165,16 +170,15 @@ def _gains_of(run: Run) -> Iterator[tuple[Cell, ...]]:
 
 def _compared(run: Run, options: Sequence[str]) -> tuple[Cell, ...]:
     record, config = run.best.record, run.config
-    found = run.certificates.get("000")
+    certificate = run.certificates.get("000")
     before = run.initial.volumes["sum"] if run.initial else None
-    kept = [seen.get("kept") for seen in run.verification.values()]
     return (
         run.name, f"{words(config.search.objective)}, {config.search.mode}", *record["design"].values(),
         *record["weights"]["q"], *record["weights"]["r"], *(record["policy"][name] for name in options),
         *(run.best.volumes[name] for name in VOLUMES),
         ratio(run.best.volumes["sum"], before) if before is not None else None, record["rung"],
-        *((found.shown["sum"], found.guarantee) if found and found.shown else (None, None)),
-        _refuted(not all(kept)) if kept else None, wall_time(run),
+        *((certificate.shown["sum"], certificate.guarantee) if certificate and certificate.shown else (None, None)),
+        verdict(run), wall_time(run),
     )  # fmt: skip
 
 

@@ -4,16 +4,11 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import matplotlib
-
-matplotlib.use("Agg")
-import matplotlib.pyplot as plt
 from matplotlib.axes import Axes
 
-from rtcd_jax.system.files import writing
+from rtcd_jax.analysis.report.canvas import blank, written
 
 Rows = Sequence[Mapping[str, Any]]
-FORMATS = ("png", "pdf")
 
 
 def draw(rows: Rows, folder: Path) -> list[Path]:
@@ -22,16 +17,11 @@ def draw(rows: Rows, folder: Path) -> list[Path]:
     measured = [row for row in rows if not row["failed"]]
     if not measured:
         return []
-    figure, axes = plt.subplots(2, 3, figsize=(13, 7.5), layout="constrained")
     panels: list[Callable[[Axes, Rows], None]] = [_rate, _cost, _strong, _weak, _memory, _shares]
-    for axis, panel in zip(axes.flat, panels, strict=True):
-        panel(axis, measured)
-    paths = [folder / f"scaling.{suffix}" for suffix in FORMATS]
-    for path in paths:
-        with writing(path):
-            figure.savefig(path, dpi=150)
-    plt.close(figure)
-    return paths
+    with blank((13, 7.5)) as figure:
+        for axis, panel in zip(figure.subplots(2, 3).flat, panels, strict=True):
+            panel(axis, measured)
+        return written(figure, folder, "scaling")
 
 
 def _by(rows: Rows, name: str) -> dict[int, list[Mapping[str, Any]]]:
@@ -89,8 +79,8 @@ def _weak(axis: Axes, rows: Rows) -> None:
     for share, part in sorted(shares.items()):
         if len(part) > 1:
             first = min(part, key=lambda row: row["devices"])
-            kept = [first["generation_s"] / row["generation_s"] for row in part]
-            axis.plot([row["devices"] for row in part], kept, "o-", label=f"{share:g} candidates a device")
+            efficiencies = [first["generation_s"] / row["generation_s"] for row in part]
+            axis.plot([row["devices"] for row in part], efficiencies, "o-", label=f"{share:g} candidates a device")
     axis.axhline(1, color="k", linestyle=":", label="ideal")
     axis.set_xticks(sorted({row["devices"] for row in rows}))
     axis.set_ylim(0, 1.15)

@@ -5,7 +5,8 @@ import pytest
 from matplotlib.collections import PolyCollection
 from matplotlib.text import Text
 
-from rtcd_jax.analysis.report.funnels import draw_funnels, draw_levels, draw_over
+from rtcd_jax.analysis.report.funnels import draw_funnels, draw_over
+from rtcd_jax.analysis.report.page import draw_figures
 from rtcd_jax.analysis.report.reading import compared, read_run
 from rtcd_jax.analysis.report.shapes import outlines, planes, projections
 from tests.analysis.report.runs import candidate, experiment, finished, run_folder
@@ -162,12 +163,14 @@ def test_with_both_funnels_nothing_is_said_to_be_missing(run, figures):
 
 def test_levels_and_volumes_of_every_knot_are_drawn_over_time(run, figures):
     folder, config = run
-    draw_levels(read_run(folder))
-    levels, volumes = figures[0].axes
+    draw_figures(read_run(folder))
+    (levels_figure,) = {drawn for drawn in figures if "level ρ" in drawn.axes[0].get_ylabel()}
+    levels, volumes = levels_figure.axes
     for i, (arrays, _) in enumerate([candidate(config), candidate(config, 1, 3.0)]):
         for axes, name in ((levels, "rho"), (volumes, "volumes_per_knot")):
             np.testing.assert_array_equal(axes.lines[i].get_xydata(), np.stack([arrays["time"], arrays[name]], axis=1))
-    assert "sampled: failure probability" in texts(figures[0])
+    assert (levels.get_yscale(), volumes.get_yscale()) == ("log", "log")
+    assert "sampled: failure probability" in texts(levels_figure)
 
 
 def test_compared_funnels_lie_over_one_another_the_largest_lowest(tmp_path, figures):

@@ -7,8 +7,9 @@ import pytest
 
 from rtcd_jax.analysis.report import refresh, report
 from rtcd_jax.analysis.report.page import render
-from rtcd_jax.analysis.report.plots import plots
+from rtcd_jax.analysis.report.progress import charts
 from rtcd_jax.analysis.report.reading import compared, read_run
+from rtcd_jax.analysis.report.traces import plot
 from rtcd_jax.system.errors import UserError
 from tests.analysis.report import browser
 from tests.analysis.report.runs import candidate, experiment, finished, proved, run_folder, verify_and_disturb
@@ -155,13 +156,25 @@ def test_a_page_that_is_there_is_brought_up_to_date_and_none_is_made(tmp_path):
 
 def test_compared_searches_show_best_median_and_feasible_share_over_their_candidates(tmp_path):
     runs = compared([read_run(finished(tmp_path / name, scale=scale)) for name, scale in (("rtc", 2.0), ("rtcd", 5.0))])
-    data = plots(runs)["convergence"]["data"]
-    assert [(line["name"], line["yaxis"]) for line in data[:3]] == [
-        ("rtc (sum)", "y"), ("rtc, median", "y"), ("rtc, feasible", "y2"),
+    data = plot(charts(runs)["convergence"])["data"]
+    assert [(line["name"], line["yaxis"], line["showlegend"]) for line in data if line["legendgroup"] == "rtc"] == [
+        ("rtc (sum)", "y", True), ("rtc, median", "y", False), ("rtc, feasible", "y2", False),
     ]  # fmt: skip
-    assert [line["y"] for line in data[3:]] == [[100.0, 101.0, 102.0], [60.0] * 3, [0.75] * 3]
+    second = [line for line in data if line["legendgroup"] == "rtcd"]
+    assert [line["y"] for line in second] == [[100.0, 101.0, 102.0], [60.0] * 3, [0.75] * 3]
     assert all(line["x"] == [4, 8, 12] for line in data)
-    assert {line["line"]["color"] for line in data[3:]} == {runs[1].color}
+    assert {line["line"]["color"] for line in second} == {runs[1].color}
+
+
+def test_plotly_knows_every_property_of_every_plot(pages):
+    from plotly.graph_objects import Figure
+
+    for name, count in FIGURES.items():
+        (data,) = re.findall(r'id="figures">(.*?)</script>', pages[name].read_text(), flags=re.DOTALL)
+        drawn = json.loads(data)
+        assert len(drawn) == count
+        for each in drawn.values():
+            assert len(Figure(each["data"], each["layout"]).data) == len(each["data"])
 
 
 def test_one_run_gets_its_page_and_figures_several_get_one_beside_them(tmp_path, figures):

@@ -5,9 +5,10 @@ import pytest
 from matplotlib.collections import LineCollection
 from matplotlib.text import Text
 
+from rtcd_jax.analysis.report.canvas import print_chart
 from rtcd_jax.analysis.report.history import courses, failures, physical, spread
 from rtcd_jax.analysis.report.history import searched as searched_variables
-from rtcd_jax.analysis.report.progress import draw_convergence, draw_courses
+from rtcd_jax.analysis.report.progress import charts
 from rtcd_jax.analysis.report.reading import read_run
 from tests.analysis.report.runs import SEARCHED_POLICY, candidate, experiment, generation, run_folder
 
@@ -15,6 +16,10 @@ from tests.analysis.report.runs import SEARCHED_POLICY, candidate, experiment, g
 def searched(tmp_path, generations, plant="pendulum"):
     config = experiment(plant)
     return read_run(run_folder(tmp_path / "run", config, best=candidate(config), generations=generations))
+
+
+def draw(name, run):
+    print_chart(charts([run])[name], run.figures, name)
 
 
 def texts(figure):
@@ -28,7 +33,7 @@ def lines(axes, label):
 def test_convergence_draws_the_stored_numbers_with_gaps_where_there_were_none(tmp_path, figures):
     records = [generation(k, sigma=0.3 / (k + 1)) for k in range(6)]
     records[2] |= {"best": None, "median": None, "feasible": 0.0}
-    draw_convergence(searched(tmp_path, records))
+    draw("convergence", searched(tmp_path, records))
     volumes, share, sigma = figures[0].axes
     for label, name in (("best", "best"), ("median", "median"), ("best so far", "best_so_far")):
         (line,) = lines(volumes, label)
@@ -41,7 +46,7 @@ def test_convergence_draws_the_stored_numbers_with_gaps_where_there_were_none(tm
 
 def test_restarts_are_marked_at_their_generations_alone(tmp_path, figures):
     records = [generation(k, restarts=restarts) for k, restarts in enumerate([0, 0, 1, 1, 3])]
-    draw_convergence(searched(tmp_path, records))
+    draw("convergence", searched(tmp_path, records))
     for axes in figures[0].axes:
         *_, marks = [drawn for drawn in axes.collections if isinstance(drawn, LineCollection)]
         assert [segment[0, 0] for segment in marks.get_segments()] == [2, 4]
@@ -49,26 +54,26 @@ def test_restarts_are_marked_at_their_generations_alone(tmp_path, figures):
 
 
 def test_without_restarts_the_legend_has_none(tmp_path, figures):
-    draw_convergence(searched(tmp_path, [generation(0), generation(1)]))
+    draw("convergence", searched(tmp_path, [generation(0), generation(1)]))
     assert "restart" not in texts(figures[0])
 
 
 @pytest.mark.parametrize(("lowest", "scale"), [(11.0, "linear"), (9.0, "log")])
 def test_an_axis_of_more_than_a_decade_is_logarithmic(tmp_path, figures, lowest, scale):
     records = [generation(0, median=lowest), generation(1, best=100.0, best_so_far=100.0)]
-    draw_convergence(searched(tmp_path, records))
+    draw("convergence", searched(tmp_path, records))
     assert figures[0].axes[0].get_yscale() == scale
 
 
 def test_a_search_without_any_volume_can_be_drawn(tmp_path, figures):
     nothing = {"best": None, "median": None, "best_so_far": None, "feasible": 0.0}
-    draw_convergence(searched(tmp_path, [generation(0, **nothing)]))
+    draw("convergence", searched(tmp_path, [generation(0, **nothing)]))
     assert np.isnan(figures[0].axes[0].lines[0].get_ydata()).all()
 
 
 def test_a_variable_is_drawn_in_its_own_unit_between_the_ends_of_its_box(tmp_path, figures):
     run = searched(tmp_path, [generation(k) for k in range(4)])
-    draw_courses(run)
+    draw("courses", run)
     told = [axes.get_title() for axes in figures[0].axes]
     assert told == [
         "mass [kg]", "length [m]", "q1 of θ [1/(s rad²)]", "q2 of dθ/dt [1/(s (rad/s)²)]",
