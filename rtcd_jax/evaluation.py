@@ -79,8 +79,8 @@ def make_evaluate(problem: Problem, budget: SamplingBudget | None = None) -> Eva
         count = genomes.shape[0]
         batch = count if on_gpu() else batch_in_cache(problem, count)
         padded = jax.tree.map(lambda leaf: _padded(leaf, -count % batch), (genomes, candidates, trajectories))
-        found = jax.lax.map(assess, padded, batch_size=batch)
-        return jax.tree.map(lambda leaf: leaf[:count], found)
+        evaluation = jax.lax.map(assess, padded, batch_size=batch)
+        return jax.tree.map(lambda leaf: leaf[:count], evaluation)
 
     return evaluate
 

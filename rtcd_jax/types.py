@@ -42,10 +42,10 @@ _MESSAGES = {
 
 def first_failure(*statuses: Int[Array, ""]) -> Int[Array, ""]:
     """The first status that is not `OK`, in the order of the flow."""
-    kept = jnp.asarray(statuses[0], jnp.int32)
+    first = jnp.asarray(statuses[0], jnp.int32)
     for status in statuses[1:]:
-        kept = jnp.where(kept != Status.OK, kept, jnp.asarray(status, jnp.int32))
-    return kept
+        first = jnp.where(first != Status.OK, first, jnp.asarray(status, jnp.int32))
+    return first
 
 
 class Candidate(eqx.Module):

@@ -1,4 +1,4 @@
-"""How a command ends: its exit codes, one line for whatever stopped it, interrupts, and streams that nobody reads.
+"""How a command ends: its exit codes, one line for whatever stopped it, interrupts, and streams that are closed.
 
 A command ends within two seconds of Ctrl-C wherever it is: first KeyboardInterrupt unwinds the main thread; if that is
 inside XLA, or the exception got lost in a callback, a watching thread ends the process. That tears nothing that is
@@ -46,7 +46,7 @@ class Exit(enum.IntEnum):
     LOST_PROCESS = 75, "another process of the run has ended; the same command goes on"
     PREEMPTED = 85, "asked to stop (SIGTERM); all is saved, the same command goes on"
     INTERRUPTED = 130, "interrupted (Ctrl-C); the same command goes on"
-    CUT_OFF = 141, "nobody reads the output any more"
+    CUT_OFF = 141, "the output is closed"
 
 
 def explain(error: BaseException, debug: bool = False) -> Exit:
@@ -81,13 +81,13 @@ def explain(error: BaseException, debug: bool = False) -> Exit:
 
 
 def _about_devices(error: BaseException) -> bool:
-    """Whether JAX did not get the devices that it was told to use; it may only assert that."""
+    """Whether JAX did not get the devices of JAX_PLATFORMS: its own code raised, sometimes a bare AssertionError."""
     frames = traceback.extract_tb(error.__traceback__)
     return bool(frames and os.environ.get("JAX_PLATFORMS")) and frames[-1].filename.endswith("xla_bridge.py")
 
 
 def say(text: str) -> None:
-    """Lines on stderr, printable whatever they quote; nothing where nobody reads them."""
+    """Lines on stderr, printable whatever they quote; nothing where the stream is closed."""
     with contextlib.suppress(OSError, ValueError):
         print(printable_lines(text), file=sys.stderr, flush=True)
 

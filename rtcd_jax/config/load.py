@@ -77,10 +77,10 @@ class Config(Settings):
 
     def variables(self) -> dict[str, Variable]:
         """Every variable by its dotted key: the design in the plant's order, then q, r, and the policy's."""
-        found = {f"design.{name}": variable for name, variable in self.design.items()}
-        for letter, variables in self.weights:
-            found |= {f"weights.{letter}.{i}": variable for i, variable in enumerate(variables)}
-        return found | {f"policy.{name}": variable for name, variable in self.policy.variables().items()}
+        variables = {f"design.{name}": variable for name, variable in self.design.items()}
+        for letter, weights in self.weights:
+            variables |= {f"weights.{letter}.{i}": weight for i, weight in enumerate(weights)}
+        return variables | {f"policy.{name}": variable for name, variable in self.policy.variables().items()}
 
     def logarithmic(self, key: str) -> bool:
         """Whether the search scales the variable of this dotted key logarithmically."""
@@ -192,8 +192,8 @@ def parse(data: Any, source: str = "configuration") -> Config:
     if isinstance(data, Mapping):
         # pydantic checks between sections only if every section is valid: run those that can be run.
         failed = {problem.path[0] for problem in problems if problem.path}
-        found = _across_sections(_valid_sections(data, failed))
-        problems += [problem for problem in found if problem not in problems]
+        across = _across_sections(_valid_sections(data, failed))
+        problems += [problem for problem in across if problem not in problems]
     raise ConfigError(problems, source)
 
 

@@ -76,8 +76,8 @@ def bounds(field: FieldInfo) -> str:
 
 def unit(field: FieldInfo) -> str:
     """The unit in brackets in the field's description; empty if it has none."""
-    found = _UNIT.search(str(field.description))
-    return found.group(1) if found else ""
+    match = _UNIT.search(str(field.description))
+    return match.group(1) if match else ""
 
 
 def without_unit(field: FieldInfo) -> str:

@@ -84,8 +84,8 @@ class _Loader(yaml.SafeLoader):
         keys = set()
         for key, _ in node.value:
             if key.tag not in (_TEXT, _MERGE):
-                found = f", not {key.value}" if isinstance(key, yaml.ScalarNode) else ""
-                _refuse(f"a key must be a text{found}; in quotes everything is one", key)
+                given = f", not {key.value}" if isinstance(key, yaml.ScalarNode) else ""
+                _refuse(f"a key must be a text{given}; in quotes everything is one", key)
             if key.value in keys:
                 _refuse(f"the key {key.value!r} is given twice", key)
             keys.add(key.value)

@@ -76,12 +76,12 @@ class ControlRate:
 
 
 def control_rate(
-    elite: Elite, proof: ProvedFunnel | None, tell: Callable[[int, int], None] = lambda done, of: None
+    elite: Elite, proof: ProvedFunnel | None, show: Callable[[int, int], None] = lambda done, of: None
 ) -> ControlRate:
     """The slowest tried rate at which the boundaries of a funnel's ellipsoids at the knots stay inside.
 
     A state stays if it is within the limits at every step, in the funnel at every later knot, in a proved one at every
-    call, and arrives at the goal. `tell(done, of)` is told the rates.
+    call, and arrives at the goal. `show(done, of)` is called after every rate.
 
     Raises:
         UserError: a goal that its own LQR does not hold.
@@ -98,22 +98,22 @@ def control_rate(
     x = elite.x[knots] + np.einsum("sij,sj->si", axes[knots], y / np.linalg.norm(y, axis=1, keepdims=True))
     funnel = replace(elite, S=np.linalg.inv(axes @ np.swapaxes(axes, 1, 2)), rho=np.ones(len(axes)))
 
-    kept = np.ones(STATES, bool)
+    held = np.ones(STATES, bool)
     if proof is None:
         step = min(interval / STEPS, STEP_OF_FASTEST / fastest_rate(elite, f))
-        kept = ~simulate(funnel, f, runge_kutta(f, step), knots, x).failed
-    knots, x = knots[kept], x[kept]
+        held = ~simulate(funnel, f, runge_kutta(f, step), knots, x).failed
+    knots, x = knots[held], x[held]
     tried = [divisor for divisor in DIVISORS if divisor / interval <= FASTEST]
     failed: dict[int, float] = {}
     slowest, end = 0, len(tried)
     while slowest < end:  # by bisection: what a rate keeps inside, faster ones do
-        tell(len(failed), len(tried).bit_length())
+        show(len(failed), len(tried).bit_length())
         middle = (slowest + end) // 2
         share = _share_of_failures(funnel, f, interval / tried[middle], knots, x, within)
         failed[tried[middle]] = share
         slowest, end = (middle + 1, end) if share else (slowest, middle)
     divisor = tried[slowest] if slowest < len(tried) else None
-    return ControlRate(divisor, interval, len(x), int(np.sum(~kept)), dict(sorted(failed.items())))
+    return ControlRate(divisor, interval, len(x), int(np.sum(~held)), dict(sorted(failed.items())))
 
 
 def _share_of_failures(

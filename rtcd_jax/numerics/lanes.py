@@ -1,7 +1,7 @@
 """Many independent iterative problems on a fixed number of lanes, refilled as problems finish.
 
 A vmapped while_loop makes every problem wait for its slowest neighbor. Here a finished lane hands over
-its result and takes the next problem, so that stragglers cost only themselves. A lane's arithmetic never
+its result and takes the next problem, so that slow problems do not delay the others. A lane's arithmetic never
 looks at another lane: the result of a problem does not depend on which problems it ran beside.
 """
 

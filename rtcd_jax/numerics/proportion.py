@@ -1,4 +1,4 @@
-"""Confidence in a proportion seen in independent trials (Clopper and Pearson, Biometrika 26, 1934)."""
+"""Confidence in a proportion of independent trials (Clopper and Pearson, Biometrika 26, 1934)."""
 
 import math
 

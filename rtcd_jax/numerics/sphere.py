@@ -26,10 +26,10 @@ def climb(f: Callable, y: Float[Array, "n *batch"], steps: int) -> Float[Array, 
     def step(y, _):
         value, j = value_and_jacobian(f, y)
         tried = _largest_nearby(mtm(j, j), mtv(j, value - mv(j, y)), y)
-        found = jnp.sum(f(tried) ** 2, 0)
-        found = jnp.where(jnp.isfinite(found), found, -jnp.inf)
-        highest = jnp.argmax(found, -1, keepdims=True)
-        better = jnp.max(found, -1) > jnp.sum(value**2, 0)
+        sizes = jnp.sum(f(tried) ** 2, 0)
+        sizes = jnp.where(jnp.isfinite(sizes), sizes, -jnp.inf)
+        highest = jnp.argmax(sizes, -1, keepdims=True)
+        better = jnp.max(sizes, -1) > jnp.sum(value**2, 0)
         return jnp.where(better, jnp.take_along_axis(tried, highest[None], -1)[..., 0], y), None
 
     return short_scan(step, y, length=steps)[0]

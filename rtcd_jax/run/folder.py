@@ -197,9 +197,9 @@ class RunFolder:
         For process 0.
         """
         file = self.path / "provenance.json"
-        told = read_json(file, _FORGET)
-        told["starts"][-1]["seconds"] = round(time.monotonic() - self._begun, 1)
-        replace_json(file, told)
+        record = read_json(file, _FORGET)
+        record["starts"][-1]["seconds"] = round(time.monotonic() - self._begun, 1)
+        replace_json(file, record)
 
     def write_initial(self, arrays: Arrays, record: Record) -> None:
         """The configuration's initial candidate, in the elites' format."""
@@ -220,15 +220,15 @@ class RunFolder:
 
     def _cut(self, generations: int) -> None:
         """Leaves the complete lines of the first `generations` alone."""
-        kept = [line for line in _lines(self._lines_path) if line.index < generations]
-        end = sum(line.length for line in kept)
-        if not kept or end == kept[-1].start + kept[-1].length:  # nothing else between them
+        earlier = [line for line in _lines(self._lines_path) if line.index < generations]
+        end = sum(line.length for line in earlier)
+        if not earlier or end == earlier[-1].start + earlier[-1].length:  # nothing else between them
             with writing(self._lines_path):
                 os.truncate(self._lines_path, end)
             return
         with reading(self._lines_path, _FORGET):
             content = self._lines_path.read_bytes()
-        replace(self._lines_path, b"".join(content[line.start : line.start + line.length] for line in kept))
+        replace(self._lines_path, b"".join(content[line.start : line.start + line.length] for line in earlier))
 
 
 class _Line(NamedTuple):

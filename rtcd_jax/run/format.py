@@ -107,6 +107,6 @@ def _spread(evaluations: Sequence[Evaluation]) -> dict[str, Any]:
     """Standard deviation over mean of every volume, over evaluations that differ in their random numbers alone."""
     volumes = {name: [float(e.volumes[name]) for e in evaluations] for name in VOLUMES}
     relative = {
-        name: np.std(found, ddof=1) / np.mean(found) if np.mean(found) else None for name, found in volumes.items()
+        name: np.std(values, ddof=1) / np.mean(values) if np.mean(values) else None for name, values in volumes.items()
     }
     return {"keys": len(evaluations), "volumes": relative}

@@ -1,4 +1,4 @@
-"""One YAML, many runs: a `sweep` section of dotted keys and their values, and a table of what the runs found.
+"""One YAML, many runs: a `sweep` section of dotted keys and their values, and a table of their results.
 
     sweep:
       product:                          # every combination of

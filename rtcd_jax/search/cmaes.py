@@ -167,8 +167,8 @@ def restart(strategy: Strategy, state: State, key: Key[Array, ""]) -> State:
 
 def _weight(costs: Float[Array, " P"], feasible: Bool[Array, " P"]) -> Float[Array, ""]:
     """gamma = 100 max(1, median f - min f) over the feasible points."""
-    kept = jnp.where(feasible, costs, jnp.nan)
-    return 100.0 * jnp.where(jnp.any(feasible), jnp.maximum(1.0, jnp.nanmedian(kept) - jnp.nanmin(kept)), 1.0)
+    known = jnp.where(feasible, costs, jnp.nan)
+    return 100.0 * jnp.where(jnp.any(feasible), jnp.maximum(1.0, jnp.nanmedian(known) - jnp.nanmin(known)), 1.0)
 
 
 def _outside(points: Float[Array, "P d"]) -> Float[Array, " P"]:

@@ -87,7 +87,7 @@ class SearchState(eqx.Module):
 @final
 @dataclasses.dataclass(frozen=True)
 class Generation:
-    """What one generation found, on the host; volumes are NaN where a candidate failed.
+    """One generation's results, on the host; volumes are NaN where a candidate failed.
 
     `volumes` are [P] each by the objectives' names; `best` and `median` (over the feasible) are those of `objective`
     in this generation, `best_so_far` that of the archive (all sampled); `feasible` is a share, `counts` and

@@ -1,7 +1,7 @@
 """The devices and processes of a run: one mesh `candidates` over all of them, on JAX's own distributed runtime.
 
 Nothing else mentions devices. Every process holds the same search state and takes the same decisions; whatever could
-differ between two machines (a clock, a signal, the last bits of an eigenvector) is process 0's, told to the others.
+differ between two machines (a clock, a signal, the last bits of an eigenvector) is process 0's, sent to the others.
 """
 
 import contextlib
@@ -28,11 +28,11 @@ Value = TypeVar("Value")
 
 
 def initialize(coordinator: str | None = None, processes: int | None = None, index: int | None = None) -> None:
-    """Makes this process one of the run's: as told, or as srun or mpirun tell JAX; otherwise it is alone."""
-    told = {"coordinator_address": coordinator, "num_processes": processes, "process_id": index}
+    """Makes this process one of the run's: as the arguments say, or srun or mpirun; otherwise it is alone."""
+    places = {"coordinator_address": coordinator, "num_processes": processes, "process_id": index}
     started = (os.environ.get(name, "1") for name in ("SLURM_STEP_NUM_TASKS", "OMPI_COMM_WORLD_SIZE"))
     if coordinator is not None or any(count != "1" for count in started):
-        jax.distributed.initialize(**told, heartbeat_timeout_seconds=HEARTBEAT)
+        jax.distributed.initialize(**places, heartbeat_timeout_seconds=HEARTBEAT)
 
 
 def shutdown() -> None:

@@ -40,15 +40,15 @@ class ConfigError(UserError):
         self.source = source
         first, *others = self.problems
         where = f"{source}: " if source else ""
-        told = [
+        lines = [
             f"{where}{len(self.problems)} errors",
             *(f"  {problem}" for problem in self.problems[:_MOST_PROBLEMS]),
         ]
         if len(self.problems) > _MOST_PROBLEMS:
-            told.append(f"  and {len(self.problems) - _MOST_PROBLEMS} more")
+            lines.append(f"  and {len(self.problems) - _MOST_PROBLEMS} more")
         if not others:
-            told = [f"{where}{first if first.path or first.value is not NO_VALUE else first.text}"]
-        super().__init__("\n".join(told))
+            lines = [f"{where}{first if first.path or first.value is not NO_VALUE else first.text}"]
+        super().__init__("\n".join(lines))
 
     def __reduce__(self) -> tuple[type[Self], tuple[tuple[Problem, ...], str]]:
         """What a worker process hands back is made again from its parts."""

@@ -91,9 +91,8 @@ def animate_run(folder: Path, to: Path | None, seed: int, console: Console) -> l
 
 def ffmpeg() -> str | None:
     """The program that writes MP4: that of the PATH, else imageio-ffmpeg's, else None."""
-    found = shutil.which("ffmpeg")
-    if found:
-        return found
+    if program := shutil.which("ffmpeg"):
+        return program
     with contextlib.suppress(ImportError, RuntimeError):
         from imageio_ffmpeg import get_ffmpeg_exe  # pyright: ignore[reportMissingImports]
 

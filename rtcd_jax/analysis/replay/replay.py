@@ -49,7 +49,7 @@ class Replay:
         return self.ratio <= 1
 
     @property
-    def kept(self) -> bool:
+    def held(self) -> bool:
         return bool(self.inside.all())
 
     @property
@@ -72,12 +72,12 @@ class Replay:
 
     def as_record(self) -> dict[str, Any]:
         """As JSON stores it: `closest` is the sample with the smallest margin 1 - V/rho."""
-        first = None if self.kept else self.sample(int(np.argmin(self.inside)))
+        first = None if self.held else self.sample(int(np.argmin(self.inside)))
         return {
             "elite": self.name,
             "columns": {name: column.heading for name, column in self.measured.columns.items()},
             "samples": len(self.ratio),
-            "inside": self.kept,
+            "inside": self.held,
             "share_inside": float(self.inside.mean()),
             "covered": self.covered,
             "share_covered": self.covered / float(self.elite.time[-1]),
@@ -123,7 +123,7 @@ def replay_run(
     for line in [f"columns: {taken}", *measured.notes, *jumps(measured, states), *_summary(replay)]:
         console.message(line)
     console.message(f"V/rho of every sample, and its figure: {results / stem}.csv, .json, .png, .pdf")
-    return replay.kept
+    return replay.held
 
 
 def _check_time(file: Path, measured: Measured, end: float) -> None:
@@ -146,7 +146,7 @@ def _summary(replay: Replay) -> list[str]:
         f"{record['samples']} samples, t = {time[0]:.4g} to {time[-1]:.4g} s, of the motion's {end:.4g} s they cover "
         f"{record['share_covered']:.1%}; the funnel of {record['elite']} ({record['rung']})"
     ]
-    if replay.kept:
+    if replay.held:
         whole = f"inside the funnel {'all the way' if replay.complete else 'at every sample'}"
         lines.append(f"{whole}; smallest margin 1 - V/rho = {record['smallest_margin']:.3g}")
         lines.append(f"closest to its boundary {_at(record['closest'])}")

@@ -225,18 +225,18 @@ def _certificates(path: Path, console: Console) -> Iterator[tuple[str, Certifica
             yield name, Certificate(None, "not found", "no goal region could be shown")
             continue
         what = f"checking {certificate_path(path, name)}  interval"
-        found = standing(path, name, lambda done, total, what=what: show(done, total, what))
+        proof = standing(path, name, lambda done, total, what=what: show(done, total, what))
         with reading(summary, _ADVICE):
             beside = {"seconds": float(written["seconds"]), "sampled": _numbers(written["sampled"])}
-            if found.proved:
-                shown = {"start": found.start, "intervals": found.intervals, "shown": found.volumes}
-                yield name, Certificate("proved", found.verdict, **beside, **shown)
-            elif found.verdict == "refused" and written["rung"] == "certified":  # in floating-point numbers, no more
+            if proof.proved:
+                shown = {"start": proof.start, "intervals": proof.intervals, "shown": proof.volumes}
+                yield name, Certificate("proved", proof.verdict, **beside, **shown)
+            elif proof.verdict == "refused" and written["rung"] == "certified":  # in floating-point numbers, no more
                 shown = {"start": float(written["start"]), "intervals": int(written["intervals"])}
                 shown |= {"shown": _numbers(written["found"])}
-                yield name, Certificate("certified", found.verdict, found.reason, **beside, **shown)
+                yield name, Certificate("certified", proof.verdict, proof.reason, **beside, **shown)
             else:
-                yield name, Certificate(None, found.verdict, found.reason, **beside)
+                yield name, Certificate(None, proof.verdict, proof.reason, **beside)
 
 
 def _numbers(written: Mapping[str, Any]) -> dict[str, float]:

@@ -44,12 +44,12 @@ def measure(path: Path, population: int, devices: int, repeats: int) -> dict[str
     config = config.model_copy(update={"search": settings})
     problem, cluster = make_problem(config), Cluster.of(devices)
     chunk = device_chunk(problem, -(-population // devices), cluster.memory)
-    spread_out, evaluations = sharded(make_evaluate(problem), cluster, chunk), []
+    evaluate_sharded, evaluations = sharded(make_evaluate(problem), cluster, chunk), []
 
     def evaluate(genomes, key):
-        found, took = timed(lambda: spread_out(genomes, key))
+        evaluation, took = timed(lambda: evaluate_sharded(genomes, key))
         evaluations.append(took)
-        return found
+        return evaluation
 
     plan = search.Plan(settings, config.elites, tuple(initial_genome(problem).tolist()), problem.design_dims)
     genomes = jnp.zeros((population, len(problem.free)))

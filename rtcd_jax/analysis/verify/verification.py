@@ -128,7 +128,7 @@ class Trial:
 
     def _merged(self, name: str, outcomes: Mapping[tuple[str, int], Outcome]) -> Outcome:
         whole = {field.name: np.zeros(self.states, bool) for field in fields(Outcome)}
-        for field, seen in whole.items():
+        for field, flags in whole.items():
             for chunk in range(self.chunks):
-                seen[chunk :: self.chunks] = getattr(outcomes[name, chunk], field)
+                flags[chunk :: self.chunks] = getattr(outcomes[name, chunk], field)
         return Outcome(**whole)
