@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 class Volume(NamedTuple):
     """A number of the knots' ellipsoid volumes v [N+1], in the product of the states' units times `seconds` [s].
 
-    `of(v, logs, dt)` is its formula; `logs` are the logarithms of v.
+    `of(v, logs, dt)` is its formula, for arrays of JAX or numpy; `logs` are the logarithms of v.
     """
 
     meaning: str
@@ -22,17 +22,14 @@ class Volume(NamedTuple):
     seconds: int = 0
 
 
-def _geometric_mean(v, logs, dt):
-    import jax.numpy as jnp
-
-    return jnp.exp(jnp.mean(logs))
-
-
 VOLUMES = {
     "sum": Volume("v_0 + … + v_N, the paper's", lambda v, logs, dt: v.sum()),
     "integral": Volume("trapezoid rule over time", lambda v, logs, dt: dt * ((v[1:] + v[:-1]).sum() / 2), seconds=1),
     "inlet": Volume("v_0 of the initial ellipsoid", lambda v, logs, dt: v[0]),
-    "geometric_mean": Volume("(v_0 … v_N)^(1 / (N+1)), which an empty knot brings to zero", _geometric_mean),
+    "geometric_mean": Volume(
+        "(v_0 … v_N)^(1 / (N+1)), which an empty knot brings to zero",
+        lambda v, logs, dt: logs.__array_namespace__().exp(logs.mean()),
+    ),
 }
 
 

@@ -20,6 +20,7 @@ from rtcd_jax.cli import main as cli
 from rtcd_jax.elite.records import read_elite
 from rtcd_jax.system.console import silent
 from rtcd_jax.system.errors import UserError
+from rtcd_jax.volume import VOLUMES, Volume
 from tests.analysis.replay.test_measured import mutated
 from tests.certificate import swing
 
@@ -63,6 +64,17 @@ def test_a_table_is_read_bit_by_bit(tmp_path):
     np.testing.assert_allclose(stored["volumes_per_knot"], 4 * math.pi / np.sqrt(np.linalg.det(arrays["S"])))
     assert record["rung"] == "claimed"
     assert record["state_limits"] == [7.0, 7.0]
+
+
+def test_an_external_funnel_has_every_volume_of_the_list(tmp_path, monkeypatch):
+    monkeypatch.setitem(VOLUMES, "largest", Volume("the largest knot's", lambda v, logs, dt: v.max()))
+    external = read(table(tmp_path / "x.csv"))
+    arrays, record = elite_of(external, cost(external))
+    v = external.volumes
+    dt = external.dt
+    expected = [v.sum(), np.trapezoid(v, dx=dt), v[0], np.prod(v) ** (1 / len(v)), v.max()]
+    np.testing.assert_allclose([arrays[f"volumes_{name}"] for name in VOLUMES], expected)
+    np.testing.assert_allclose([record["volumes"][name] for name in VOLUMES], expected)
 
 
 def test_a_motion_that_solves_the_dynamics_is_left_as_it_is(tmp_path):

@@ -18,6 +18,7 @@ from rtcd_jax.certificate.prove.closed_loop import linear
 from rtcd_jax.elite.elite import CLAIMED
 from rtcd_jax.system.delimited import number_or_nan, read_table, shown
 from rtcd_jax.system.errors import UserError, closest, printable
+from rtcd_jax.volume import VOLUMES
 
 EVEN = 1e-6
 """Share of an interval by which the knots' times may be off an even grid."""
@@ -209,14 +210,13 @@ def elite_of(external: ExternalFunnel, cost: Cost) -> tuple[dict[str, np.ndarray
         for x, u, s in zip(external.x, inputs, external.S, strict=True)
     ]
     volumes = external.volumes
+    named = {name: volume.of(volumes, np.log(volumes), external.dt) for name, volume in VOLUMES.items()}
     arrays = {
         "time": external.dt * np.arange(len(external.x)), "x": external.x, "u": external.u[:, None],
         "K": np.array(gains)[:, None], "S": external.S, "rho": external.rho,
         "Q": np.diag(cost.q), "R": np.array([[cost.r]]),
         "K_goal": gains[-1][None], "x_goal": external.goal, "u_max": np.array([external.limit]),
-        "volumes_per_knot": volumes, "volumes_sum": volumes.sum(), "volumes_inlet": volumes[0],
-        "volumes_integral": np.trapezoid(volumes, dx=external.dt),
-        "volumes_geometric_mean": np.exp(np.mean(np.log(volumes))),
+        "volumes_per_knot": volumes, **{f"volumes_{name}": value for name, value in named.items()},
     }  # fmt: skip
     record = {
         "plant": external.name,
@@ -228,7 +228,7 @@ def elite_of(external: ExternalFunnel, cost: Cost) -> tuple[dict[str, np.ndarray
         "epsilon": 0.0,
         "confidence": CONFIDENCE,
         "volumes": {
-            **{kind: float(arrays[f"volumes_{kind}"]) for kind in ("sum", "integral", "inlet", "geometric_mean")},
+            **{name: float(value) for name, value in named.items()},
             "share_of_largest_knot": float(volumes.max() / volumes.sum()),
         },
     }
