@@ -88,7 +88,7 @@ class Policy(eqx.Module):
 
 
 class Funnel(eqx.Module):
-    """B_k = {x : V_k(x) <= levels_k}. `trials` fresh states of B_k were rolled out without a failure."""
+    """B_k = {x : V_k(x) <= levels_k}. `trials` held-out states of B_k were rolled out without a failure."""
 
     policy: Policy
     levels: Float[Array, "*batch knots"]

@@ -2,7 +2,7 @@
 
     python launch/bench/published.py [pendulum | cartpole | off_the_rail]
 
-Prints the four volumes (sampled rung) of the initial candidate and of the published optima, each with its ratio to the
+Prints the four volumes (sampled) of the initial candidate and of the published optima, each with its ratio to the
 initial one's, and the largest knot's share of the sum: what the best of a run has to be compared with. Off the rail
 the cart-pole's nominal motion stays on it and its funnel does not, as in the paper; two candidates more, the best of a
 search on the rail and a corner of the weights' box, show what the rail costs.

@@ -65,7 +65,7 @@ VERBS = {
     "scale": Verb("rtcd_jax.cli.search_verbs:scale", "measure what a generation costs against population and devices"),
     "verify": Verb(
         "rtcd_jax.cli.run_verbs:verify",
-        "simulate fresh random states of a run's funnels with independent integrators",
+        "simulate held-out states of a run's funnels with independent simulators",
         jax=True,
         shown=True,
     ),

@@ -22,7 +22,7 @@ def _verdict(held: bool) -> Exit:
 
 
 class VerifyOptions(Options):
-    """Simulate fresh random states of a run's funnels with independent integrators; exit code 1 if too many fail.
+    """Simulate held-out states of a run's funnels with independent simulators; exit code 1 if too many fail.
 
     The same command goes on after a stop.
 
@@ -31,7 +31,7 @@ class VerifyOptions(Options):
 
     run: Run = Field(description="the run folder")
     states: int = Field(
-        default=1000, description="fresh states, over the ellipsoids of all knots, one each at least [-]", ge=1
+        default=1000, description="held-out states, over the ellipsoids of all knots, one each at least [-]", ge=1
     )
     seed: int = Field(default=0, description="of the states [-]", ge=0)
     workers: int = Field(default=0, description="processes, 0 for one a core [-]", ge=0)
@@ -159,15 +159,15 @@ def export(options: ExportOptions, console: Console) -> Exit:
 class CertifyOptions(Options):
     """Prove the funnels of a run's best elites by sums of squares; `rtcd check` checks what this writes.
 
-    Rungs: certified, by the solver's floating-point numbers; proved, by exact arithmetic for the true dynamics. The
-    same command goes on after a kill. Exit code 1 if a funnel was not shown from t = 0 to the goal.
+    Guarantees: certified, by the solver's floating-point numbers; proved, by exact arithmetic for the true dynamics.
+    The same command goes on after a kill. Exit code 1 if a funnel was not shown from t = 0 to the goal.
 
     Example: rtcd certify checkpoints/pendulum_rtcd --elites 8 --optimize_value
     """
 
     run: Run = Field(description="the run folder")
     elites: int = Field(default=1, description="how many, the best first [-]", ge=1)
-    rung: Literal["certified", "proved"] = Field(default="proved", description="how much is to be shown")
+    rung: Literal["certified", "proved"] = Field(default="proved", description="the guarantee to be shown")
     optimize_value: bool = Field(default=False, description="choose the ellipsoids' shapes too")
     workers: int = Field(default=0, description="processes, one elite each; 0 for one a core [-]", ge=0)
 
@@ -242,7 +242,7 @@ class AuditOptions(Options):
     state_limits: Annotated[tuple[Annotated[float, Field(allow_inf_nan=True)], ...], shown("LIMIT …", "none")] = Field(
         default=(), description="largest |x_i|, inf for none [state's unit]"
     )
-    states: int = Field(default=1000, description="fresh states of each ellipsoid [-]", ge=1)
+    states: int = Field(default=1000, description="random states of each ellipsoid [-]", ge=1)
     seed: int = Field(default=0, description="of the states [-]", ge=0)
 
 

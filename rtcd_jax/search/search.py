@@ -4,7 +4,7 @@ The search sees its problem through one deterministic function alone:
 
     evaluate(genomes [P, d], key) -> Evaluated      a population in the unit box, `key` its common random numbers
 
-At its end the elites are evaluated once more, with more samples and fresh directions; `finish` sorts them by that.
+At its end the elites are evaluated once more, with more samples and other directions; `finish` sorts them by that.
 
 All randomness of a generation is fold_in(key(seed), index): the same state always has the same next state.
 """

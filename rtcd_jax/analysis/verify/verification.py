@@ -81,7 +81,7 @@ class Verification:
 @final
 @dataclass(frozen=True)
 class Trial:
-    """A funnel, the fresh states that it is tried with, and how these are cut into chunks.
+    """A funnel, the held-out states that it is verified with, and how these are cut into chunks.
 
     Every chunk has states of every knot, and is the same whoever simulates it, and when.
 

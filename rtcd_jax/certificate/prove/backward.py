@@ -61,7 +61,7 @@ def on_grid(matrix: np.ndarray) -> list[list]:
 
 @final
 class BackwardProof:
-    """The proof of one elite's funnel. `exact` runs the checker after every interval (rung *proved*)."""
+    """The proof of one elite's funnel. `exact` runs the checker after every interval (*proved*)."""
 
     def __init__(self, claim: Claim, loop: Loop, exact: bool):
         self.claim, self.loop, self.exact = claim, loop, exact

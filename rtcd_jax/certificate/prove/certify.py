@@ -40,7 +40,7 @@ class Step(NamedTuple):
 class Outcome(NamedTuple):
     """A finished certificate beside what was sampled; volumes over the knots from `start` [s] on.
 
-    `volumes` are the certificate's. `beside` is the rung of the `sampled` ones: another for an external elite.
+    `volumes` are the certificate's. `beside` is the guarantee of the `sampled` ones: another for an external elite.
     """
 
     elite: str
@@ -116,7 +116,7 @@ def certify_elite(
 
 
 def _finish(path: Path, content: dict[str, Any], elite: Elite, rung: str, seconds: float, journal: Journal) -> Outcome:
-    """Writes the certificate. On the rung *proved* the checker has accepted the whole file before."""
+    """Writes the certificate; one that says *proved* after the checker has accepted the whole file."""
     file = (json.dumps(content, separators=(",", ":")) + "\n").encode()
     if rung == "proved":
         digest = hashlib.sha256(file).hexdigest()
