@@ -26,8 +26,11 @@ from rtcd_jax.types import Candidate, Status, Trajectory
 SWING = 0.4
 """Amplitude of the starting guesses' swings over the distance from start to goal."""
 
-SHARES = (0.5, 0.25)
-"""Steps of the starting guesses, as shares of their box; the one that more often ends better comes first."""
+SHARES = (0.5, 0.25, 0.95, 0.75)
+"""Steps of the starting guesses, as shares of their box; the one that more often ends better comes first.
+
+The longest solve most of what the first two leave.
+"""
 
 PATIENCE = 2
 """Iterations that a further start may take, over those that solved the candidate before."""
@@ -37,10 +40,10 @@ RESOLVED_RATE = 1e-3
 
 
 def plan(problem: Problem, candidates: Candidate) -> Trajectory:
-    """The cheapest trajectory found from `starts` of a small family of starts, for every candidate [P].
+    """The cheapest trajectory found from the first `starts` of a small family of starts, for every candidate [P].
 
-    Where a start fails, the next one takes its place. A candidate's result does not depend on the others. Its status is
-    TRAJECTORY_NOT_SOLVED if no start ended within 1e-9 of the interval map and inside the boxes.
+    Where these fail, the others follow until one is solved. A candidate's result does not depend on its neighbors'.
+    Its status is TRAJECTORY_NOT_SOLVED if no start ended within 1e-9 of the interval map and inside the boxes.
     """
     settings = problem.config.trajectory
     parameters = jax.tree.map(lambda leaf: jnp.moveaxis(leaf, 0, -1), candidates)
@@ -56,17 +59,17 @@ def plan(problem: Problem, candidates: Candidate) -> Trajectory:
     )
     most = settings.max_iterations
 
-    def attempt(known, guess):
-        best, solved = known
+    def attempt(best, start):
+        index, guess = start
         # A start that takes much longer than the one before it seldom ends better.
         allowance = jnp.where(best.solved, jnp.minimum(PATIENCE * best.iterations, most), most)
-        allowance = jnp.where(solved < settings.starts, allowance, 0)
+        allowance = jnp.where((index < settings.starts) | ~best.solved, allowance, 0)
         found = interior_point.solve(control, parameters, guess, allowance)
-        return (_better(best, found, allowance > 0), solved + found.solved), None
+        return _better(best, found, allowance > 0), None
 
     family = starts(problem, parameters.q.dtype)
     none = _nothing(family, candidates.q.shape[0])
-    (best, _), _ = packed_scan(attempt, (none, none.iterations), family, carry=False)
+    best, _ = packed_scan(attempt, none, (np.arange(len(SHARES)), family), carry=False)
     us, xs, h = (jnp.moveaxis(leaf, -1, 0) for leaf in (best.us, best.xs, best.h))
     status = jnp.where(best.solved, Status.OK, Status.TRAJECTORY_NOT_SOLVED).astype(jnp.int32)
     return Trajectory(us, xs, h, best.cost, best.defect, best.iterations, status)
@@ -107,7 +110,7 @@ def _better(best: interior_point.Solution, found: interior_point.Solution, tried
 
 
 def starts(problem: Problem, dtype: DTypeLike) -> interior_point.Guess:
-    """The family [G ...] of guesses: swing to and fro about the start, then into the goal, in a long and a short time.
+    """The family [G ...] of guesses: swing to and fro about the start, then into the goal, in longer and shorter times.
 
     Which one ends best depends on how many swings the candidate needs. They are motions, no solutions of the dynamics:
     rolling the dynamics out under a sinusoidal input and bending the end into the goal needs four times the iterations,

@@ -151,7 +151,7 @@ class TrajectoryConfig(Settings):
     )
     max_iterations: int = Field(default=200, ge=1, le=100_000, description="iterations of the trajectory optimizer [-]")
     starts: int = Field(
-        default=1, ge=1, le=2, description="starts to solve, the cheapest is kept; others replace those that fail [-]"
+        default=1, ge=1, le=2, description="starts to solve, the cheapest is kept; where all fail, others follow [-]"
     )
 
 
