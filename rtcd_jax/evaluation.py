@@ -12,6 +12,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from rtcd_jax import rollout
+from rtcd_jax.adversary import Worst
 from rtcd_jax.funnel import estimate_funnel
 from rtcd_jax.genome import decode
 from rtcd_jax.numerics.interior_point import CACHE, VECTOR
@@ -38,22 +39,31 @@ def search_budget(problem: Problem) -> SamplingBudget:
     """That of a generation: two rounds of held-out samples, a share of them through MJX if the rollouts are mixed."""
     funnel = problem.config.funnel
     share = rollout.mjx(problem.plant) if funnel.rollouts == "mixed" else None
-    use = rollout.mjx if funnel.rollouts == "mjx" else rollout.closed_form
-    physics = use(problem.plant)
-    return SamplingBudget(funnel, Dynamics(physics, physics, share), rounds=2)
+    physics = _physics(problem)
+    return SamplingBudget(funnel, Dynamics(physics, physics, share), rounds=2, uncertainty=problem.uncertainty)
 
 
 def elite_budget(problem: Problem) -> SamplingBudget:
     """That of the elites: more directions, held-out samples followed to the goal until a round has no failure."""
-    config = problem.config
-    elites = config.elites
+    elites = problem.config.elites
     counts = {"directions": elites.directions, "trials": min(elites.trials, FIRST_SAMPLES)}
-    use = rollout.mjx if config.funnel.rollouts == "mjx" else rollout.closed_form
-    physics = use(problem.plant)
-    funnel = config.funnel.model_copy(update=counts)
+    physics = _physics(problem)
+    funnel = problem.config.funnel.model_copy(update=counts)
     return SamplingBudget(
-        funnel, Dynamics(physics, physics), rounds=40, samples_per_knot=elites.trials, batch=path_batch()
+        funnel,
+        Dynamics(physics, physics),
+        rounds=40,
+        samples_per_knot=elites.trials,
+        batch=path_batch(),
+        uncertainty=problem.uncertainty,
     )
+
+
+def _physics(problem: Problem) -> rollout.Dynamics:
+    if problem.uncertainty is not None:
+        return rollout.closed_form(problem.plant, Worst(problem.plant, problem.uncertainty))
+    use = rollout.mjx if problem.config.funnel.rollouts == "mjx" else rollout.closed_form
+    return use(problem.plant)
 
 
 def elite_key() -> PRNGKeyArray:

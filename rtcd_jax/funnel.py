@@ -17,6 +17,7 @@ import numpy as np
 from jaxtyping import Array, Int, PRNGKeyArray
 
 from rtcd_jax import rollout
+from rtcd_jax.adversary import Opponent
 from rtcd_jax.numerics import sampling
 from rtcd_jax.numerics.batched import solve_lower
 from rtcd_jax.numerics.ellipsoid import Ellipsoids
@@ -70,14 +71,17 @@ def estimate_funnel(
     levels, samples = validate_intervals(rollouts, levels, keys[2], budget)
     if budget.samples_per_knot:
         levels, samples = validate_paths(rollouts, levels, keys[3], budget, samples_per_knot)
-    full = jnp.all(levels >= (jnp.minimum(boxes, saturated) * SMALLEST) ** 2) & jnp.all(boxes > 0)
+    filled = (levels >= (jnp.minimum(boxes, saturated) * SMALLEST) ** 2) & (boxes > 0)
+    full = jnp.all(filled)
     finite = jnp.all(jnp.isfinite(levels)) & jnp.all(jnp.isfinite(policy.values))
     status = first_failure(
         policy.status,
         jnp.where(finite, Status.OK, Status.NOT_FINITE),
         jnp.where(full, Status.OK, Status.FUNNEL_EMPTY),
     )
-    return Funnel(policy, levels, samples, status)
+    uncertain = budget.dynamics.directions.opponent is not None
+    borne = jnp.mean(jnp.cumprod(filled[::-1]).astype(levels.dtype)) if uncertain else None
+    return Funnel(policy, levels, samples, status, borne)
 
 
 def _scan_knots(rollouts: Rollouts, boxes, last, key, budget: SamplingBudget):
@@ -90,7 +94,8 @@ def _scan_knots(rollouts: Rollouts, boxes, last, key, budget: SamplingBudget):
         step = _Step.at(rollouts, index)
 
         expected = jnp.minimum(jnp.sqrt(target) * shrinkage, box)
-        adversarial = climb(partial(step.ends_alone, expected), adversarial, funnel.climbs)
+        alone = partial(step.ends_alone, expected, opponent=budget.dynamics.directions.opponent)
+        adversarial = climb(alone, adversarial, funnel.climbs)
         directions = jnp.concatenate([drawn, adversarial], 1)
 
         def look(radius, window):
@@ -144,9 +149,9 @@ class _Step(NamedTuple):
         ends, peaks = self.rollouts.roll(self.tracking, x, dynamics)
         return self.there.to_ball(ends)[:, 0], peaks[0]
 
-    def ends_alone(self, radii, y):
+    def ends_alone(self, radii, y, opponent: Opponent | None):
         """The ends under the plant's own equations."""
-        return self.ends(radii, y, rollout.closed_form(self.rollouts.problem.plant))[0]
+        return self.ends(radii, y, rollout.closed_form(self.rollouts.problem.plant, opponent))[0]
 
 
 def _saturating_radius(problem, policy, goal_set: Ellipsoids):
@@ -162,24 +167,40 @@ def _goal_level(problem, candidate, policy, goal_set: Ellipsoids, box, key, budg
     V then decreases at all multiples of the horizon, so that every state arrives: a Lyapunov function of the map over
     the horizon, which for a long one reaches out to the ellipsoid's whole region of attraction.
     """
-    goal, gain = budget.funnel.goal, policy.gains[-1]
+    goal, lqr, dynamics = budget.funnel.goal, (policy.gains[-1], policy.values[-1]), budget.dynamics.directions
+
+    def growth(radii, key):
+        """The `radii` along directions [D J], and what becomes of V and the boxes there: bad if > 1."""
+        directions = sampling.directions(key, goal.directions, problem.plant.n, box.dtype)
+        grid = jnp.broadcast_to(radii, (goal.directions, len(radii)))
+        x = goal_set.points(grid[None], directions[:, None, :, None])
+        ends, peaks = rollout.roll_at_goal(problem, candidate, lqr, x, dynamics, goal.horizon, goal.step)
+        return grid, jnp.maximum(goal_set.level(ends) / grid**2, peaks**2)[0]
 
     def narrow(bracket, key):
         """Of a ladder of radii over the bracket, the last good one and the one above it, and the crossing between."""
         low, high, _ = bracket
         ladder = low * (high / low) ** np.linspace(0, 1, goal.radii)
-        directions = sampling.directions(key, goal.directions, problem.plant.n, box.dtype)
-        grid = jnp.broadcast_to(ladder, (goal.directions, goal.radii))
-        x = goal_set.points(grid[None], directions[:, None, :, None])
-        dynamics = budget.dynamics.directions
-        ends, peaks = rollout.roll_at_goal(problem, candidate, gain, x, dynamics, goal.horizon, goal.step)
-        crossing = jnp.min(_crossings(grid, jnp.maximum(goal_set.level(ends) / grid**2, peaks**2)[0]))
+        if dynamics.opponent is not None:
+            ladder = jnp.minimum(ladder, high)  # the highest may be the only good one, and the box just there
+        grid, bad = growth(ladder, key)
+        if dynamics.opponent is not None:
+            # Below the first radius from which V falls lies what the disturbance keeps away from the goal.
+            good = bad <= 1
+            bad = jnp.where((jnp.cumsum(good, 1) > 0) | ~jnp.any(good, 1, keepdims=True), bad, 0.5)
+        crossing = jnp.min(_crossings(grid, bad))
         index = jnp.clip(jnp.searchsorted(ladder, crossing, side="right") - 1, 0, goal.radii - 2)
         return (ladder[index] / BRACKET_OVERLAP, ladder[index + 1], crossing), None
 
     # Far out the rollouts diverge so steeply that no crossing can be interpolated before the bracket is narrow.
     start = (box * SMALLEST, box, box)
     (_, _, radius), _ = jax.lax.scan(narrow, start, jax.random.split(key, goal.rounds))
+    if dynamics.opponent is not None:
+        # The residual set must be one: from its rim, and from there outward, V falls.
+        residual = dynamics.opponent.uncertainty.residual
+        ladder = radius * residual ** np.linspace(1, 0, goal.radii)[:-1]
+        _, bad = growth(ladder, jax.random.fold_in(key, goal.rounds))
+        radius = jnp.where(jnp.all(bad <= 1), radius, 0.0)
     return (1 - MARGIN) * radius**2
 
 

@@ -14,6 +14,7 @@ from rtcd_jax.plants.base import Plant
 from rtcd_jax.system.devices import require_float64
 from rtcd_jax.system.errors import ConfigError
 from rtcd_jax.system.errors import Problem as Fault
+from rtcd_jax.types import Uncertainty
 
 AT_REST = 1e-6
 """Largest rate of a goal [state/s]: one typed with 16 digits leaves the rounding of pi times the stiffness."""
@@ -54,6 +55,8 @@ class Problem:
     state_limits: Float[np.ndarray, " n"]
     input_limits: Float[np.ndarray, " m"]
     variables: tuple[Variable, ...]
+    uncertainty: Uncertainty | None = None
+    """What the funnels must bear; None for one exact model."""
 
     @property
     def intervals(self) -> int:
@@ -88,6 +91,7 @@ def make_problem(config: Config) -> Problem:
         state_limits=np.array(config.task.state_limits, float),
         input_limits=np.array(plant.input_limit, float),
         variables=tuple(_variables(config)),
+        uncertainty=_uncertainty(config),
     )
     _require_equilibrium(problem)
     _require_agreement(problem)
@@ -104,6 +108,20 @@ def _variables(config: Config):
             free=variable.free,
             logarithmic=config.logarithmic(key),
         )
+
+
+def _uncertainty(config: Config) -> Uncertainty | None:
+    box = config.uncertainty
+    if box.empty:
+        return None
+    return Uncertainty(
+        parameters={name: jnp.asarray(width) for name, width in (box.design | box.plant).items()},
+        input_limit=jnp.asarray(box.input_limit),
+        input=jnp.asarray(box.input),
+        noise=jnp.array(box.noise) if any(box.noise) else None,
+        age=jnp.asarray(box.age) if box.age else None,
+        residual=jnp.asarray(box.residual),
+    )
 
 
 def _require_equilibrium(problem: Problem) -> None:

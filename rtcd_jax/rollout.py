@@ -7,7 +7,7 @@ interpolant, K linear between K_k and K_{k+1}; after t_N the goal's LQR. Errors 
 
 from collections.abc import Callable
 from functools import partial
-from typing import NamedTuple
+from typing import NamedTuple, cast
 
 import equinox as eqx
 import jax
@@ -15,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from rtcd_jax.adversary import Opponent, Situation
 from rtcd_jax.numerics.integrate import END, MIDDLE, START, rk4_varying_step, split
 from rtcd_jax.numerics.loops import short_scan
 from rtcd_jax.plants.base import Plant
@@ -24,15 +25,19 @@ from rtcd_jax.types import Candidate, Policy
 
 
 class Dynamics(NamedTuple):
-    """`rate(design, x [n ...], u [m ...]) -> x' [n ...]`; a `large` one is put once into a step's program."""
+    """`rate(design, x [n ...], u [m ...]) -> x' [n ...]`; a `large` one is put once into a step's program.
+
+    With an `opponent`, x' is what that makes of the nominal robot.
+    """
 
     rate: Callable
     large: bool
+    opponent: Opponent | None = None
 
 
-def closed_form(plant: Plant) -> Dynamics:
+def closed_form(plant: Plant, opponent: Opponent | None = None) -> Dynamics:
     """The plant's own equations."""
-    return Dynamics(plant.dynamics, large=False)
+    return Dynamics(plant.dynamics, large=False, opponent=opponent)
 
 
 def mjx(plant: Plant) -> Dynamics:
@@ -51,17 +56,20 @@ def mjx(plant: Plant) -> Dynamics:
 
 class TrackingData(NamedTuple):
     """Feed-forward and gain schedule: what the controller looks up at both ends and the middle of every Runge-Kutta
-    step. Leading axes are (step, stage).
+    step. Leading axes are (step, stage). `costs` are S(t), `rates` those of x*(t), for opponents.
     """
 
     states: Float[Array, "steps 3 n intervals"]
     gains: Float[Array, "steps 3 m n intervals"]
+    costs: Float[Array, "steps 3 n n intervals"]
+    rates: Float[Array, "steps 3 n intervals"]
     inputs: Float[Array, "m intervals"]
     step: Float[Array, ""]
 
     def part(self, which: Int[Array | np.ndarray, " chosen"]) -> "TrackingData":
         """The intervals `which`."""
-        return TrackingData(self.states[..., which], self.gains[..., which], self.inputs[..., which], self.step)
+        states, gains, costs, rates, inputs, step = self
+        return TrackingData(*(table[..., which] for table in (states, gains, costs, rates, inputs)), step=step)
 
 
 def tracking_data(problem: Problem, candidate: Candidate, policy: Policy, steps: int) -> TrackingData:
@@ -69,12 +77,21 @@ def tracking_data(problem: Problem, candidate: Candidate, policy: Policy, steps:
     motion = nominal(problem, candidate, policy.trajectory)
     grid = np.arange(2 * steps + 1) / (2 * steps)
     stages = 2 * np.arange(steps)[:, None] + np.arange(3)
-    gains = jnp.moveaxis(policy.gains, 0, -1)[None]
     shares = grid[:, None, None, None]
-    blended = gains[..., :-1] * (1 - shares) + gains[..., 1:] * shares
+
+    def linear(table):
+        """Between the knots, where the stages are."""
+        at_knots = jnp.moveaxis(table, 0, -1)[None]
+        return (at_knots[..., :-1] * (1 - shares) + at_knots[..., 1:] * shares)[stages]
+
+    states = motion.at(grid)
+    inputs = jnp.broadcast_to(motion.inputs[..., None], (problem.plant.m, *states.shape[1:]))
+    rates = problem.plant.dynamics(candidate.design, states, inputs)
     return TrackingData(
-        states=jnp.moveaxis(motion.at(grid), -1, 0)[stages],
-        gains=blended[stages],
+        states=jnp.moveaxis(states, -1, 0)[stages],
+        gains=linear(policy.gains),
+        costs=linear(policy.values),
+        rates=jnp.moveaxis(rates, -1, 0)[stages],
         inputs=motion.inputs,
         step=policy.trajectory.dt / steps,
     )
@@ -97,37 +114,45 @@ def roll_intervals(
 
     def step(carry, stage):
         x, peak = carry
-        states, gains = stage
+        states, gains, *others = stage
 
         def slope(x, place):
             error = [a - align(b) for a, b in zip(x, states[place], strict=True)]
-            u = jnp.clip(feedforward - _feedback(align(gains[place]), error), -bounds, bounds)
-            return split(dynamics.rate(candidate.design, jnp.stack(x), u))
+            gain = align(gains[place])
+            asked = feedforward - _feedback(gain, error)
+            cost, rate = [align(table[place]) for table in others] or (None, None)
+            return _rate(dynamics, candidate, Situation(x, error, asked, gain, cost, rate, bounds))
 
         x = _step(slope, x, tracking.step, dynamics.large)
         return (x, jnp.maximum(peak, _fill(x, limits))), None
 
+    others = () if dynamics.opponent is None else (tracking.costs, tracking.rates)
+    tables = tracking.states, tracking.gains, *others
     start = split(x)
-    (ends, peak), _ = short_scan(step, (start, _fill(start, limits)), (tracking.states, tracking.gains))
+    (ends, peak), _ = short_scan(step, (start, _fill(start, limits)), tables)
     return jnp.stack(ends), peak
 
 
 def roll_at_goal(
     problem: Problem,
     candidate: Candidate,
-    gain: Float[Array, "m n"],
+    goal_lqr: tuple[Float[Array, "m n"], Float[Array, "n n"]],
     x: Float[Array, "n *batch"],
     dynamics: Dynamics,
     duration: float,
     step: float,
 ) -> tuple[Float[Array, "n *batch"], Float[Array, "*batch"]]:
-    """End states after `duration` [s] under the goal's LQR, and the largest |x_i| / limit_i till then."""
+    """End states after `duration` [s] under the goal's LQR, and the largest |x_i| / limit_i till then.
+
+    `goal_lqr` are its gain and its value matrix.
+    """
     limits, bounds = problem.state_limits, _column(problem.input_limits, x)
-    gain = _align(gain, x.ndim - 1)
+    gain, cost = (_align(part, x.ndim - 1) for part in goal_lqr)
+    rest = jnp.zeros((x.shape[0], *(1,) * (x.ndim - 1)), x.dtype)
 
     def slope(x, _):
         error = [a - b for a, b in zip(x, problem.goal.astype(x[0].dtype), strict=True)]
-        return split(dynamics.rate(candidate.design, jnp.stack(x), jnp.clip(-_feedback(gain, error), -bounds, bounds)))
+        return _rate(dynamics, candidate, Situation(x, error, -_feedback(gain, error), gain, cost, rest, bounds))
 
     def advance(_, carry):
         x, peak = carry
@@ -139,9 +164,16 @@ def roll_at_goal(
     return jnp.stack(ends), peak
 
 
-def _feedback(gain, error):
+def _rate(dynamics: Dynamics, candidate: Candidate, at: Situation):
+    """The components of x' in a closed loop."""
+    if dynamics.opponent is not None:
+        return dynamics.opponent.rate(candidate.design, at)
+    return split(dynamics.rate(candidate.design, jnp.stack(at.x), jnp.clip(at.asked, -at.bounds, at.bounds)))
+
+
+def _feedback(gain, error) -> Array:
     """K e [m ...] for components e."""
-    return sum(gain[:, i] * e for i, e in enumerate(error))
+    return cast(Array, sum(gain[:, i] * e for i, e in enumerate(error)))
 
 
 def _fill(x, limits: np.ndarray):

@@ -59,6 +59,25 @@ class Candidate(eqx.Module):
     policy: dict[str, Float[Array, "*batch"]] = eqx.field(default_factory=dict)
 
 
+class Uncertainty(eqx.Module):
+    """Half widths of what a funnel must bear: of the robot's numbers and the input limits as shares [-], of a
+    disturbance on the motors' axes [input's unit], of the measured state [states' units], the age of the oldest
+    measurement that acts [s]; at the goal a motion may stay below the share `residual` of the region. None is no cost.
+    """
+
+    parameters: dict[str, Float[Array, "*batch"]]
+    input_limit: Float[Array, "*batch"]
+    input: Float[Array, "*batch"]
+    noise: Float[Array, "*batch n"] | None
+    age: Float[Array, "*batch"] | None
+    residual: Float[Array, "*batch"]
+
+    def times(self, factor: Float[Array, "*batch"] | float) -> "Uncertainty":
+        """The box scaled by a factor; `residual` stays."""
+        scaled = jax.tree.map(lambda width: width * factor, self)
+        return eqx.tree_at(lambda each: each.residual, scaled, self.residual)
+
+
 class Trajectory(eqx.Module):
     """A nominal motion on intervals of equal length `dt` [s], the input held inside each interval.
 
@@ -88,12 +107,16 @@ class Policy(eqx.Module):
 
 
 class Funnel(eqx.Module):
-    """B_k = {x : V_k(x) <= levels_k}. `trials` held-out states of B_k were rolled out without a failure."""
+    """B_k = {x : V_k(x) <= levels_k}. `trials` held-out states of B_k were rolled out without a failure.
+
+    `borne`, where something is uncertain: the share of the knots, from the last one backward, that have a level.
+    """
 
     policy: Policy
     levels: Float[Array, "*batch knots"]
     trials: Int[Array, "*batch knots"]
     status: Int[Array, "*batch"]
+    borne: Float[Array, "*batch"] | None = None
 
 
 @jax.tree_util.register_pytree_with_keys_class
@@ -136,6 +159,11 @@ class Evaluation(eqx.Module):
     funnel: Funnel
     volumes: Volumes
     status: Int[Array, "*batch"]
+
+    @property
+    def borne(self) -> Float[Array, "*batch"] | None:
+        """The share of knots with a level under the uncertainty; None where nothing is uncertain."""
+        return self.funnel.borne
 
     def take(self, rows: Int[Array | np.ndarray, " E"]) -> "Evaluation":
         """Of a population's evaluation: the candidates at `rows`."""

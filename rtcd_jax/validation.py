@@ -18,12 +18,13 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from rtcd_jax import rollout
+from rtcd_jax.adversary import Drawn
 from rtcd_jax.config.schema import FunnelConfig, GoalConfig
 from rtcd_jax.numerics import sampling
 from rtcd_jax.numerics.ellipsoid import Ellipsoids
 from rtcd_jax.numerics.loops import packed_scan
 from rtcd_jax.problem import Problem
-from rtcd_jax.types import Candidate, Policy, Status
+from rtcd_jax.types import Candidate, Policy, Status, Uncertainty
 
 SAFETY = 0.98
 """Level over that of the lowest held-out sample that failed."""
@@ -54,6 +55,7 @@ class SamplingBudget:
     rounds: int
     samples_per_knot: int = 0
     batch: int = 2048
+    uncertainty: Uncertainty | None = None
 
 
 class Rollouts(NamedTuple):
@@ -90,12 +92,19 @@ class Rollouts(NamedTuple):
         return ends[:, 0], peaks[0] <= 1
 
     def arrive(
-        self, x: Float[Array, "n S"], dynamics: rollout.Dynamics
+        self, x: Float[Array, "n S"], dynamics: rollout.Dynamics, last: Float[Array, ""]
     ) -> tuple[Float[Array, "n S"], Bool[Array, " S"]]:
-        """States after the horizon behind t_N, and whether they came closer to the goal, inside the boxes."""
-        gain, goal = self.policy.gains[-1], self.goal
-        ends, peaks = rollout.roll_at_goal(self.problem, self.candidate, gain, x, dynamics, goal.horizon, goal.step)
-        return ends, (peaks <= 1) & (self.level(ends, self.intervals) < self.level(x, self.intervals))
+        """States after the horizon behind t_N, and whether they came closer to the goal, inside the boxes.
+
+        Against an opponent it is enough that they stay in the residual set of the region of level `last`.
+        """
+        goal, lqr = self.goal, (self.policy.gains[-1], self.policy.values[-1])
+        ends, peaks = rollout.roll_at_goal(self.problem, self.candidate, lqr, x, dynamics, goal.horizon, goal.step)
+        before, after = self.level(x, self.intervals), self.level(ends, self.intervals)
+        closer = after < before
+        if dynamics.opponent is not None:
+            closer |= after <= dynamics.opponent.uncertainty.residual**2 * last
+        return ends, (peaks <= 1) & closer
 
     def level(self, x: Float[Array, "n S"], k: Int[Array, ""] | int) -> Float[Array, " S"]:
         """V_k of states at one knot."""
@@ -170,25 +179,27 @@ def validate_paths(
     batch = min(budget.batch, knots * most)
     last_count = jnp.asarray(most if samples_per_knot is None else samples_per_knot, int)
     first_count = jnp.asarray(min(budget.funnel.trials, most), int)
-    dynamics = rollout.closed_form(rollouts.problem.plant)
+    plant, uncertainty = rollouts.problem.plant, budget.uncertainty
 
     # Without a funnel no round would ever be clean.
     hopeful = (rollouts.policy.status == Status.OK) & jnp.all(jnp.isfinite(levels) & (levels > 0))
 
     def follow(levels, born, key):
         """Levels below those of states of the knots `born` that failed, and which of these states did."""
+        drawn = None if uncertainty is None else Drawn.of(plant, uncertainty, jax.random.fold_in(key, 1), batch)
         x = rollouts.uniform(levels, born, key)
 
         def forward(k, state):
             x, values, inside = state
             started = born <= k
-            ends, within = rollouts.interval(x, k, dynamics)
+            opponent = drawn if drawn is None else drawn.at_knot(k)
+            ends, within = rollouts.interval(x, k, rollout.closed_form(plant, opponent))
             values = values.at[k].set(rollouts.level(x, k))
             return jnp.where(started, ends, x), values, inside.at[k].set(within)
 
         blank = jnp.zeros((knots - 1, batch), x.dtype), jnp.zeros((knots - 1, batch), bool)
         x, values, inside = jax.lax.fori_loop(jnp.min(born), knots - 1, forward, (x, *blank))
-        _, arrives = rollouts.arrive(x, dynamics)
+        _, arrives = rollouts.arrive(x, rollout.closed_form(plant, drawn), levels[-1])
         last = rollouts.level(x, knots - 1)
         final = _below(levels[-1], last, ~arrives)
 
@@ -331,8 +342,8 @@ def compare_physics(
 
         nothing = jnp.zeros(born.shape, bool), jnp.full(born.shape, -1.0), born, jnp.stack([x, x])
         pair = jax.lax.fori_loop(born[0], knots - 1, forward, _Pair(x, x, *nothing))
-        ends, _ = rollouts.arrive(pair.closed_form, closed_form)
-        other, arrives = rollouts.arrive(pair.mjx, mjx)
+        ends, _ = rollouts.arrive(pair.closed_form, closed_form, levels[-1])
+        other, arrives = rollouts.arrive(pair.mjx, mjx, levels[-1])
         pair = pair._replace(closed_form=ends, mjx=other, failed=pair.failed | ~arrives)
         return None, (pair.seen(knots, difference(ends, other, knots - 1)), x)
 

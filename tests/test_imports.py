@@ -15,7 +15,7 @@ LAYERS = (
     {"types", "volume"},  # the nouns, and the list of volumes that a configuration names
     {"config"},
     {"plants"},
-    {"problem", "genome", "trajectory", "policy", "rollout", "validation", "funnel", "evaluation"},
+    {"problem", "genome", "trajectory", "policy", "adversary", "rollout", "validation", "funnel", "evaluation"},
     {"search", "elite"},
     {"run"},
     {"analysis", "certificate", "export"},
@@ -24,7 +24,10 @@ LAYERS = (
 )
 
 # The steps of the algorithm: each imports from those before it.
-STEPS = "types", "problem", "genome", "trajectory", "policy", "rollout", "validation", "funnel", "volume", "evaluation"
+STEPS = (
+    "types", "problem", "genome", "trajectory", "policy", "adversary", "rollout", "validation", "funnel", "volume",
+    "evaluation",
+)  # fmt: skip
 
 # Packages that only some modules may import.
 OWNERS = {

@@ -91,7 +91,9 @@ def _rolled(policy, x, steps, dynamics=CLOSED_FORM, problem=PROBLEM):
 
 @partial(jax.jit, static_argnames=("dynamics", "duration", "step", "problem"))
 def _rolled_at_goal(x, duration, step, dynamics=CLOSED_FORM, problem=PROBLEM):
-    return rollout.roll_at_goal(problem, CANDIDATE, jnp.asarray(GOAL_GAIN), x, dynamics, duration, step)
+    return rollout.roll_at_goal(
+        problem, CANDIDATE, (jnp.asarray(GOAL_GAIN), jnp.eye(len(x))), x, dynamics, duration, step
+    )
 
 
 def _about(policy: Policy, offsets) -> jax.Array:

@@ -31,6 +31,7 @@ from rtcd_jax.config.schema import (
     SearchConfig,
     TaskConfig,
     TrajectoryConfig,
+    UncertaintyConfig,
     Variable,
     WeightsConfig,
     read_plant,
@@ -60,6 +61,9 @@ class Config(Settings):
     weights: WeightsConfig = Field(description="cost weights >= 1e-9, searched on a log scale")
     trajectory: TrajectoryConfig = Field(default=TrajectoryConfig(), description="the nominal motion")
     policy: PolicyConfig = Field(default=PolicyConfig(), description="the controller that tracks it")
+    uncertainty: UncertaintyConfig = Field(
+        default=UncertaintyConfig(), description="what every funnel must bear; all zero: one exact model"
+    )
     funnel: FunnelConfig = Field(default=FunnelConfig(), description="how the funnel is sampled")
     search: SearchConfig = Field(default=SearchConfig(), description="CMA-ES over designs and weights")
     elites: ElitesConfig = Field(default=ElitesConfig(), description="the archive of the best")
@@ -144,6 +148,18 @@ def _positive_weights(weights: WeightsConfig) -> Iterator[Problem]:
                 yield Problem(("weights", letter, i, "min"), text, variable.min)
 
 
+def _uncertain(plant: PlantConfig, uncertainty: UncertaintyConfig, funnel: FunnelConfig) -> Iterator[Problem]:
+    for section, known in ("design", tuple(plant.design)), ("plant", plant.constants()):
+        for name in getattr(uncertainty, section):
+            if name not in known:
+                path = "uncertainty", section, name
+                yield Problem(path, f"must be a {section} parameter of {plant.name}; {closest(name, known)}")
+    if uncertainty.noise:
+        yield from _size(("uncertainty", "noise"), uncertainty.noise, plant.states)
+    if not uncertainty.empty and funnel.rollouts != "closed_form":
+        yield Problem(("funnel", "rollouts"), "must be closed_form where `uncertainty` is given", funnel.rollouts)
+
+
 def _something_free(
     design: dict[str, Variable], weights: WeightsConfig, policy: PolicyConfig, search: SearchConfig
 ) -> Iterator[Problem]:
@@ -163,6 +179,7 @@ _ACROSS: tuple[Callable[..., Iterator[Problem]], ...] = (
     _design_names,
     _positive_design,
     _positive_weights,
+    _uncertain,
     _something_free,
 )
 
@@ -241,7 +258,10 @@ def dump(config: Config) -> str:
 
 def config_hash(config: Config) -> str:
     """Twelve hexadecimal digits of the SHA-256 of the canonical JSON: equal exactly for equal configurations."""
-    canonical = json.dumps(resolved(config), sort_keys=True, separators=(",", ":"))
+    stated = resolved(config)
+    if config.uncertainty == UncertaintyConfig():
+        del stated["uncertainty"]  # as before there was such a section
+    canonical = json.dumps(stated, sort_keys=True, separators=(",", ":"))
     return hashlib.sha256(canonical.encode()).hexdigest()[:12]
 
 

@@ -28,6 +28,12 @@ class PlantConfig(Settings):
 
     name: str
 
+    @classmethod
+    def constants(cls) -> tuple[str, ...]:
+        """The numbers that may be uncertain: all but the motors' limits."""
+        fields = cls.model_fields.items()
+        return tuple(name for name, field in fields if field.annotation is float and not name.endswith("_limit"))
+
 
 class PendulumConfig(PlantConfig):
     states: ClassVar = {"theta": "rad", "theta_dot": "rad/s"}
@@ -215,6 +221,40 @@ class PolicyConfig(Settings):
     def initial(self) -> dict[str, float]:
         """The options' numbers, a variable's initial one."""
         return {name: option.initial if isinstance(option, Variable) else option for name, option in self}
+
+
+Share = Annotated[float, Field(ge=0, lt=1)]
+
+
+class UncertaintyConfig(Settings):
+    """What every funnel of the run must bear, as half widths; all zero: one exact model."""
+
+    design: dict[str, Share] = Field(default={}, description="relative half widths of design fields, by name [-]")
+    plant: dict[str, Share] = Field(
+        default={}, description="relative half widths of the robot's constants, by name [-]"
+    )
+    input_limit: Share = Field(default=0.0, description="relative half width of the motors' limits [-]")
+    input: float = Field(
+        default=0.0,
+        ge=0,
+        le=1e9,
+        description="|w(t)| of a disturbance on the motors' axes, any function of time [input's unit]",
+    )
+    noise: Annotated[tuple[Annotated[float, Field(ge=0, le=1e9)], ...], Field(strict=False)] = Field(
+        default=(), description=f"largest errors of the measured states; empty: none [{UNIT}]"
+    )
+    age: float = Field(
+        default=0.0, ge=0, le=10, description="age of the oldest measurement that acts: hold and delay [s]"
+    )
+    residual: Annotated[float, Field(gt=0, lt=1)] = Field(
+        default=0.5, description="share of the goal's region, in radius, below which a motion may stay [-]"
+    )
+
+    @property
+    def empty(self) -> bool:
+        """Whether nothing is uncertain."""
+        widths = (*self.design.values(), *self.plant.values(), *self.noise, self.input_limit, self.input, self.age)
+        return not any(widths)
 
 
 MOST_STEPS = 100_000

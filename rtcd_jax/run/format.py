@@ -73,6 +73,7 @@ def record_of(
         "rung": "sampled",
         "epsilon": epsilon(funnel.trials, config.funnel.confidence, budget.rounds * (config.elites.count + 1)),
         "confidence": config.funnel.confidence,
+        "uncertainty": None if config.uncertainty.empty else config.uncertainty.model_dump(),
         "samples": int(funnel.trials.min()),
         "volumes": {
             **{name: volumes[name] for name in VOLUMES},
@@ -90,6 +91,22 @@ def record_of(
         "seed": config.search.seed,
         "config_hash": config_hash(config),
     }
+
+
+def what_it_bears(problem: Problem) -> str:
+    """The uncertainty that every funnel of the run bears, in words."""
+    box, plant = problem.config.uncertainty, problem.plant
+    if box.empty:
+        return "one exact model"
+    units = dict(zip(plant.state_names, plant.state_units, strict=True))
+    shares = box.design | box.plant | {"input limit": box.input_limit}
+    parts = [f"{name} ± {share:.3g} of itself" for name, share in shares.items() if share]
+    parts += [f"|w(t)| <= {box.input:g} {plant.input_units[0]} on the motors' axes"] if box.input else []
+    parts += [
+        f"{name} measured within {e:g} {unit}" for (name, unit), e in zip(units.items(), box.noise, strict=False) if e
+    ]
+    parts += [f"measurements up to {box.age:g} s old"] if box.age else []
+    return ", ".join(parts)
 
 
 def epsilon(samples: np.ndarray, confidence: float, statements: int) -> float:

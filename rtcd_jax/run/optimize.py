@@ -14,7 +14,7 @@ from rtcd_jax.evaluation import device_chunk, make_evaluate
 from rtcd_jax.genome import initial_genome
 from rtcd_jax.problem import Problem, make_problem
 from rtcd_jax.run.folder import RunFolder
-from rtcd_jax.run.format import arrays_of, record_of
+from rtcd_jax.run.format import arrays_of, record_of, what_it_bears
 from rtcd_jax.run.reevaluation import Reevaluation, Reported, physics_line, row
 from rtcd_jax.run.sharding import Sharded, sharded
 from rtcd_jax.search import search
@@ -168,6 +168,7 @@ def summary(problem: Problem, initial: Reported, best: Reported) -> Iterator[str
         yield f"the initial candidate has no funnel: {Status[before['status']].message}"
     promise = f"probability <= {after['epsilon']:.2g} (confidence {after['confidence']:g})"
     yield f"best: a state uniform in any of its ellipsoids fails to arrive with {promise}"
+    yield f"all funnels bear: {what_it_bears(problem)}"
     design = ", ".join(
         f"{name} {after['design'][name]:.4g} {unit}" for name, unit in problem.plant.design_units.items()
     )

@@ -33,6 +33,7 @@ class Sharded:
     genome: Float[np.ndarray, "P d"]
     status: Int[np.ndarray, " P"]
     volumes: Volumes
+    borne: Float[np.ndarray, " P"] | None
     _parts: tuple[Evaluation, ...]
     _fetch: Callable[[Evaluation, np.ndarray], Evaluation]
 
@@ -66,8 +67,8 @@ def sharded(
         whole = cluster.replicated(jax.random.key_data(key))
         parts = [on_devices(cluster.split(part), whole) for part in np.split(padded, len(padded) // size)]
         summaries = [_summary(cluster, part) for part in parts]
-        status, volumes = jax.tree.map(lambda *leaves: np.concatenate(leaves)[:count], *summaries)
-        return Sharded(genomes, status, volumes, tuple(parts), fetch)
+        status, volumes, borne = jax.tree.map(lambda *leaves: np.concatenate(leaves)[:count], *summaries)
+        return Sharded(genomes, status, volumes, borne, tuple(parts), fetch)
 
     return evaluate_all
 
@@ -78,7 +79,8 @@ def _summary(cluster: Cluster, part: Evaluation) -> tuple[np.ndarray, Volumes]:
     while not done():
         time.sleep(POLL)
     cluster.raise_if_preempted()
-    return cluster.gathered((part.status, replace(part.volumes, per_knot=part.volumes.per_knot[:, :0])))
+    volumes = replace(part.volumes, per_knot=part.volumes.per_knot[:, :0])
+    return cluster.gathered((part.status, volumes, part.borne))
 
 
 def _rows(chunk: int, part: Evaluation, wanted: Int[Array, " E"]) -> Evaluation:

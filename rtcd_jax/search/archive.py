@@ -11,6 +11,9 @@ from jaxtyping import Array, Bool, Float, Int
 
 from rtcd_jax.types import Evaluation, Status, Volumes
 
+FAILED = 1e3
+"""Graded cost of a candidate that bears the uncertainty at all knots but one, more than any -log(volume)."""
+
 
 class Evaluated(Protocol):
     """A population's evaluation, wherever its records are: an Evaluation, or one that is sharded over devices."""
@@ -21,6 +24,8 @@ class Evaluated(Protocol):
     def volumes(self) -> Volumes: ...
     @property
     def status(self) -> Int[Array | np.ndarray, " P"]: ...
+    @property
+    def borne(self) -> Float[Array | np.ndarray, " P"] | None: ...
 
     def take(self, rows: np.ndarray, /) -> Evaluation:
         """The whole records of the candidates at `rows` [E]."""
@@ -51,6 +56,17 @@ def cost(evaluation: Evaluated, objective: str) -> Float[Array, "*P"]:
     value = jnp.asarray(evaluation.volumes[objective], jnp.float64)
     feasible = (evaluation.status == Status.OK) & jnp.isfinite(value) & (value > 0)
     return jnp.where(feasible, -jnp.log(jnp.where(feasible, value, 1.0)), jnp.inf)
+
+
+def graded_cost(evaluation: Evaluated, objective: str) -> Float[Array, "*P"]:
+    """`cost`, but finite for a candidate whose funnel does not bear the uncertainty, and less the more of its knots do.
+
+    Under a large box nearly all candidates of the first generations fail: a search among equals would learn nothing.
+    """
+    costs = cost(evaluation, objective)
+    if evaluation.borne is None:
+        return costs
+    return jnp.where(evaluation.status == Status.FUNNEL_EMPTY, FAILED * (2 - evaluation.borne), costs)
 
 
 def empty(capacity: int, example: Evaluation) -> Elites:

@@ -1,0 +1,169 @@
+"""x, u -> x' of a robot that is not the nominal one: by what V grows fastest, or as drawn for a held-out sample.
+
+Within the half widths of `uncertainty` the robot's numbers, the motor's limit, a disturbance w on the motor's axis, the
+error of the measured state, and its age are anyone's choice. All that acts through the motor is one interval of inputs
+[low, high] about u = clip(u*(t) - K(t) (x - x*(t))):
+
+    measured a seconds ago:  u + [0, a] K (x' - x*')          (first order: hold, delay, or both together)
+    read falsely:            u -+ sum_i |K_i| noise_i
+    another limit F -+ dF:   clip to both
+    disturbance:             u -+ w
+
+`Worst` takes, at every Runge-Kutta stage, that end of the interval and that corner of the parameters which raise
+V = e'S(t)e fastest: the signs of dV'/du and of dV'/dp, one reverse sweep for all parameters. This is greedy, and of
+first order in the parameters: the held-out samples are those of `Drawn` robots, which are what epsilon is about.
+"""
+
+from typing import Any, NamedTuple, TypeVar, final
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int, PRNGKeyArray
+
+from rtcd_jax.numerics.integrate import split
+from rtcd_jax.plants.base import Plant
+from rtcd_jax.types import Uncertainty
+
+
+class Situation(NamedTuple):
+    """A state of the closed loop as the controller and V see it; all share the states' trailing axes.
+
+    `asked` is u* - K e before it is clipped, `nominal_rate` [n ...] the rate of x*(t), `cost` [n n ...] is S(t); these
+    two are None where nobody asks.
+    """
+
+    x: tuple[Array, ...]
+    error: list[Array]
+    asked: Float[Array, "m *batch"]
+    gain: Float[Array, "m n *#batch"]
+    cost: Any
+    nominal_rate: Any
+    bounds: Float[Array, "m *#batch"]
+
+    def late(self, plant: Plant, design: eqx.Module) -> Float[Array, "m *batch"]:
+        """By how much the input rises for each second of the measurement's age."""
+        rate = plant.dynamics(design, jnp.stack(self.x), jnp.clip(self.asked, -self.bounds, self.bounds))
+        moving = rate - self.nominal_rate
+        return _times(self.gain, moving)
+
+
+@final
+class Worst(NamedTuple):
+    """The adversary: V grows as fast as `uncertainty` allows."""
+
+    plant: Plant
+    uncertainty: Uncertainty
+
+    def rate(self, design: eqx.Module, at: Situation) -> tuple[Array, ...]:
+        """The components of x'."""
+        may, low, high = self.uncertainty, at.asked, at.asked
+        if may.age is not None:
+            late = may.age * at.late(self.plant, design)
+            low, high = low + jnp.minimum(late, 0), high + jnp.maximum(late, 0)
+        if may.noise is not None:
+            spread = _times(jnp.abs(at.gain), may.noise)
+            low, high = low - spread, high + spread
+        weak, strong = at.bounds * (1 - may.input_limit), at.bounds * (1 + may.input_limit)
+        low = jnp.minimum(jnp.clip(low, -weak, weak), jnp.clip(low, -strong, strong)) - may.input
+        high = jnp.maximum(jnp.clip(high, -weak, weak), jnp.clip(high, -strong, strong)) + may.input
+        x, n = jnp.stack(at.x), len(at.x)
+        slope_of_v = jnp.stack([sum(at.cost[i, j] * at.error[j] for j in range(n)) for i in range(n)])
+
+        def power(scales, u):
+            return jnp.sum(slope_of_v * scaled_rate(self.plant, design, scales, x, u))
+
+        ones = {name: jnp.ones_like(at.x[0]) for name in may.parameters}
+        slopes, push = jax.grad(power, argnums=(0, 1))(ones, (low + high) / 2)
+        worst = {name: 1 + width * jnp.sign(slopes[name]) for name, width in may.parameters.items()}
+        return split(scaled_rate(self.plant, design, worst, x, jnp.where(push > 0, high, low)))
+
+
+@final
+class Drawn(NamedTuple):
+    """Robots and disturbances of held-out samples [S], in half widths: within [-1, 1], `age` in [0, 1].
+
+    Half of the robots sit at a corner of the box, the others are uniform in it. `steady` keeps w and the noise of the
+    measurement for the whole motion; the others' jump at every knot.
+    """
+
+    plant: Plant
+    uncertainty: Uncertainty
+    parameters: dict[str, Float[Array, " S"]]
+    input_limit: Float[Array, " S"]
+    age: Float[Array, " S"]
+    input: Float[Array, "m S"]
+    noise: Float[Array, "n S"]
+    steady: Float[Array, " S"]
+    key: PRNGKeyArray
+
+    @classmethod
+    def of(cls, plant: Plant, uncertainty: Uncertainty, key: PRNGKeyArray, samples: int) -> "Drawn":
+        corner, steady, *keys = jax.random.split(key, 8)
+        at_corner = jax.random.bernoulli(corner, 0.5, (samples,))
+
+        def within(key, *shape):
+            inside = jax.random.uniform(key, (*shape, samples), minval=-1.0)
+            return jnp.where(at_corner, jnp.sign(inside), inside)
+
+        parameters = within(keys[0], len(uncertainty.parameters))
+        return cls(
+            plant,
+            uncertainty,
+            dict(zip(uncertainty.parameters, parameters, strict=True)),
+            input_limit=within(keys[1]),
+            age=jnp.abs(within(keys[2])),
+            input=within(keys[3], plant.m),
+            noise=within(keys[4], plant.n),
+            steady=jax.random.bernoulli(steady, 0.5, (samples,)),
+            key=keys[5],
+        )
+
+    def at_knot(self, k: Int[Array, ""]) -> "Drawn":
+        """With the signs of w and of the noise that hold from knot k on."""
+        m, n = self.plant.m, self.plant.n
+        signs = jax.random.rademacher(jax.random.fold_in(self.key, k), (m + n, self.steady.shape[0]), self.age.dtype)
+        signs = jnp.where(self.steady, 1, signs)
+        return self._replace(input=self.input * signs[:m], noise=self.noise * signs[m:])
+
+    def rate(self, design: eqx.Module, at: Situation) -> tuple[Array, ...]:
+        """The components of x'."""
+        may, x, asked = self.uncertainty, jnp.stack(at.x), at.asked
+        if may.age is not None:
+            asked = asked + may.age * self.age * at.late(self.plant, design)
+        if may.noise is not None:
+            asked = asked - _times(at.gain, may.noise[:, None] * self.noise)
+        bounds = at.bounds * (1 + may.input_limit * self.input_limit)
+        u = jnp.clip(asked, -bounds, bounds) + may.input * self.input.reshape(-1, *(1,) * (x.ndim - 2), x.shape[-1])
+        scales = {name: 1 + width * self.parameters[name] for name, width in may.parameters.items()}
+        return split(scaled_rate(self.plant, design, scales, x, u))
+
+
+Opponent = Worst | Drawn
+
+Part = TypeVar("Part", bound=eqx.Module)
+
+
+def scaled_rate(
+    plant: Plant,
+    design: eqx.Module,
+    scales: dict[str, Float[Array, "*#batch"]],
+    x: Float[Array, "n *batch"],
+    u: Float[Array, "m *batch"],
+) -> Float[Array, "n *batch"]:
+    """x' of the robot whose design fields and constants of these names are scaled."""
+    in_design = {name: scale for name, scale in scales.items() if hasattr(design, name)}
+    in_plant = {name: scale for name, scale in scales.items() if name not in in_design}
+    return _scaled(plant, in_plant).dynamics(_scaled(design, in_design), x, u)
+
+
+def _scaled(part: Part, scales: dict[str, Any]) -> Part:
+    if not scales:
+        return part
+    values = [getattr(part, name) * scale for name, scale in scales.items()]
+    return eqx.tree_at(lambda part: [getattr(part, name) for name in scales], part, values)
+
+
+def _times(matrix, vector) -> Array:
+    """Product elementwise over all axes behind the first two."""
+    return jnp.stack([matrix[:, i] * vector[i] for i in range(matrix.shape[1])]).sum(0)

@@ -1,0 +1,218 @@
+"""Funnels under uncertainty: scalar systems against their roots, the greedy adversary against all corners of a box."""
+
+import dataclasses
+import itertools
+from functools import cache, partial
+from pathlib import Path
+from typing import ClassVar, final
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import yaml
+
+from rtcd_jax import rollout
+from rtcd_jax.adversary import Drawn, Situation, Worst, scaled_rate
+from rtcd_jax.config import load as configuration
+from rtcd_jax.evaluation import search_budget
+from rtcd_jax.funnel import MARGIN, estimate_funnel
+from rtcd_jax.plants.base import Plant
+from rtcd_jax.problem import Problem
+from rtcd_jax.types import Candidate, Policy, Status, Trajectory, Uncertainty
+from rtcd_jax.validation import Dynamics, Rollouts, SamplingBudget, validate_paths
+from tests import pipeline
+
+
+def uncertainty(residual=0.5, noise=(0.0, 0.0), age=0.0, input_limit=0.0, input=0.0, **parameters) -> Uncertainty:
+    return Uncertainty(
+        {name: jnp.asarray(width) for name, width in parameters.items()},
+        *map(jnp.asarray, (input_limit, input, noise, age, residual)),
+    )
+
+
+# ---- one state: x' = -x + c x^3 + w
+
+
+@final
+class Nothing(eqx.Module):
+    """The design of a robot that has none."""
+
+
+@final
+class Scalar(Plant):
+    """x' = -x + cubic x^3 + u"""
+
+    cubic: float = 0.0
+
+    state_names: ClassVar = ("x",)
+    state_units: ClassVar = ("m",)
+    input_names: ClassVar = ("u",)
+    input_units: ClassVar = ("N",)
+    design_units: ClassVar = {}
+    Design: ClassVar = Nothing
+    mjcf: ClassVar = Path("none")
+
+    @property
+    def input_limit(self):
+        return (1.0,)
+
+    def dynamics(self, design, x, u):
+        return jnp.stack([-x[0] + self.cubic * x[0] ** 3 + u[0]])
+
+    def energy(self, design, x):
+        return x[0]
+
+    def parameters(self, design):
+        return {}
+
+    @classmethod
+    def from_parameters(cls, parameters):
+        return cls(), Nothing()
+
+    def edit_model(self, design):
+        return {}
+
+
+def scalar_funnel(cubic: float, limit: float, may: Uncertainty):
+    """That of the uncontrolled system at rest, within |x| <= limit."""
+    data = yaml.safe_load(configuration.EXAMPLE) | {"trajectory": {"knots": 4}}
+    plant = Scalar(cubic)
+    problem = Problem(
+        configuration.parse(data), plant, np.zeros(1), np.zeros(1), np.array([limit]), np.ones(1), (), may
+    )  # fmt: skip
+    zero = jnp.zeros((), jnp.int32)
+    rest = Trajectory(jnp.zeros((3, 1)), jnp.zeros((4, 1)), jnp.asarray(0.1), *jnp.zeros((2,)), zero, zero)
+    policy = Policy(rest, jnp.zeros((4, 1, 1)), jnp.ones((4, 1, 1)), zero)
+    candidate = Candidate(Nothing(), jnp.ones(1), jnp.ones(1))
+    return jax.jit(partial(estimate_funnel, problem, candidate, policy, budget=search_budget(problem)))(
+        jax.random.key(0)
+    )
+
+
+@pytest.mark.parametrize(("share", "status"), [(1.01, Status.OK), (0.99, Status.FUNNEL_EMPTY)])
+def test_a_disturbance_is_borne_by_what_is_just_large_enough(share, status):
+    """x' = -x + w with |w| <= 0.2 stays in |x| <= r for r > 0.2 alone."""
+    funnel = scalar_funnel(0.0, share * 0.2, uncertainty(residual=0.999, noise=(0.0,), input=0.2))
+    assert funnel.status == status
+    if status == Status.OK:
+        np.testing.assert_allclose(np.sqrt(funnel.levels), share * 0.2, rtol=2 * MARGIN)
+
+
+@pytest.mark.parametrize(("residual", "status"), [(0.5, Status.OK), (0.3, Status.FUNNEL_EMPTY)])
+def test_a_region_lies_between_the_roots(residual, status):
+    """x' = -x + x^3 + w falls for all |w| <= 0.3 where r - r^3 > 0.3; what is inside the lower root stays there."""
+    low, high = sorted(root.real for root in np.roots([-1, 0, 1, -0.3]) if root.real > 0)
+    assert 0.3 * high < low < 0.5 * high
+    funnel = scalar_funnel(1.0, 10.0, uncertainty(residual=residual, noise=(0.0,), input=0.3))
+    assert funnel.status == status
+    if status == Status.OK:
+        np.testing.assert_allclose(np.sqrt(funnel.levels[-1]), high, rtol=5e-3)
+
+
+# ---- the pendulum
+
+BOX = uncertainty(mass=0.02, length=0.01, damping=0.2, input_limit=0.02, input=0.05, age=0.005)
+
+
+def situation(samples: int) -> Situation:
+    """Random states of a closed loop of the pendulum, some of them with a saturated input."""
+    rng = np.random.default_rng(0)
+    x = rng.uniform(-4, 4, (2, samples))
+    error = rng.normal(scale=0.3, size=(2, samples))
+    gain = rng.uniform(0, 6, (1, 2, samples))
+    asked = rng.uniform(-3, 3, (1, samples))
+    cost = np.array([[3.0, 1.0], [1.0, 2.0]])[..., None]
+    rate = rng.normal(size=(2, samples))
+    arrays = map(jnp.asarray, (asked, gain, cost, rate, np.full((1, samples), 2.5)))
+    return Situation(tuple(jnp.asarray(x)), list(jnp.asarray(error)), *arrays)
+
+
+def growth(at: Situation, rate) -> np.ndarray:
+    """e'S x'."""
+    return np.einsum("ij,j...,i...->...", np.asarray(at.cost)[..., 0], np.asarray(at.error), np.asarray(rate))
+
+
+def missed(may: Uncertainty) -> np.ndarray:
+    """By how much V could rise faster at the worst corner of the box than where the greedy adversary is, relatively."""
+    plant, design = pipeline.problem().plant, pipeline.problem().plant.Design(jnp.asarray(0.7), jnp.asarray(0.4))
+    at = situation(300)
+    x, largest = jnp.stack(at.x), np.full(300, -np.inf)
+    for strength, push, *corner in itertools.product((-1, 1), repeat=len(may.parameters) + 2):
+        bounds = at.bounds * (1 + strength * may.input_limit)
+        u = jnp.clip(at.asked, -bounds, bounds) + push * may.input
+        widths = may.parameters.items()
+        scales = {name: 1 + sign * width for sign, (name, width) in zip(corner, widths, strict=True)}
+        largest = np.maximum(largest, growth(at, scaled_rate(plant, design, scales, x, u)))
+    return (largest - growth(at, Worst(plant, may).rate(design, at))) / (1 + np.abs(largest))
+
+
+def test_the_greedy_corner_is_the_worst_where_the_rate_is_affine():
+    may = uncertainty(damping=0.2, input_limit=0.02, input=0.05)
+    np.testing.assert_allclose(missed(may), 0, atol=1e-14)
+
+
+def test_what_the_greedy_adversary_misses_is_of_second_order():
+    """Half the widths leave a quarter."""
+    may = uncertainty(mass=0.08, length=0.04, damping=0.2, input=0.05)
+    whole, half = missed(may), missed(may.times(0.5))
+    assert np.all(whole >= -1e-14)
+    assert np.max(whole) > 1e-4
+    assert np.max(half) < 0.35 * np.max(whole)
+
+
+def test_no_width_is_the_nominal_loop():
+    plant, design = pipeline.problem().plant, pipeline.problem().plant.Design(jnp.asarray(0.7), jnp.asarray(0.4))
+    at = situation(100)
+    nominal = plant.dynamics(design, jnp.stack(at.x), jnp.clip(at.asked, -at.bounds, at.bounds))
+    nothing = BOX.times(0.0)
+    for opponent in (Worst(plant, nothing), Drawn.of(plant, nothing, jax.random.key(0), 100)):
+        np.testing.assert_allclose(jnp.stack(opponent.rate(design, at)), nominal, rtol=1e-14)
+
+
+@cache
+def estimator():
+    """Funnels of the published RTC-D pendulum by their box."""
+    evaluated = pipeline.evaluated().take(np.array([pipeline.RTCD]))
+    one = jax.tree.map(lambda leaf: leaf[0], evaluated)
+    problem = pipeline.problem()
+
+    @jax.jit
+    def estimate(may: Uncertainty):
+        robust = dataclasses.replace(problem, uncertainty=may)
+        budget = search_budget(robust)
+        return estimate_funnel(robust, one.candidate, one.funnel.policy, pipeline.GENERATION, budget)
+
+    return estimate, one
+
+
+def test_a_larger_box_never_has_a_larger_level():
+    """Zero widths have the nominal levels, the last box none at all."""
+    estimate, nominal = estimator()
+    funnels = [estimate(BOX.times(factor)) for factor in (0.0, 0.25, 0.5, 1.0, 4.0)]
+    np.testing.assert_allclose(funnels[0].levels, nominal.funnel.levels, rtol=1e-9)
+    for wide, narrow in itertools.pairwise(funnels):
+        assert np.all(narrow.levels <= wide.levels * (1 + 1e-9))
+    assert [int(funnel.status) for funnel in funnels] == [Status.OK] * 4 + [Status.FUNNEL_EMPTY]
+    assert [float(funnel.borne) for funnel in funnels[:4]] == [1.0] * 4
+    assert 0 < funnels[4].borne < 1
+
+
+@pytest.mark.parametrize(("factor", "bears"), [(1.0, True), (2.0, False)])
+def test_robots_of_the_box_stay_and_others_are_found_out(factor, bears):
+    """A few hundred held-out samples a knot, each another robot with another disturbance."""
+    estimate, nominal = estimator()
+    problem = pipeline.problem()
+    levels = estimate(BOX).levels
+
+    @jax.jit
+    def validated(may):
+        physics = rollout.closed_form(problem.plant)
+        rollouts = Rollouts.of(problem, nominal.candidate, nominal.funnel.policy, problem.config.funnel)
+        budget = SamplingBudget(problem.config.funnel, Dynamics(physics, physics), 1, 400, 900, uncertainty=may)
+        return validate_paths(rollouts, levels, jax.random.key(1), budget)
+
+    after, samples = validated(BOX.times(factor))
+    assert (int(samples.min()) == 400) == bears
+    assert np.array_equal(after, levels) == bears
