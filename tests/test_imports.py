@@ -31,7 +31,7 @@ STEPS = (
 
 # Packages that only some modules may import.
 OWNERS = {
-    "mujoco": {"plants.mjx", "analysis.animate"},
+    "mujoco": {"plants.mjx", "plants.lagrange", "analysis.animate"},
     "cvxpy": set(),  # tests state the certificates' program with it a second time
     "clarabel": {"certificate"},
     "flint": {"certificate"},
