@@ -3,6 +3,8 @@
 Lowered without one. That they are fast there is counted by launch/bench/gpu_budget.py.
 """
 
+import importlib
+import json
 import re
 from functools import partial
 
@@ -19,7 +21,7 @@ from rtcd_jax.numerics.loops import compiled_for
 from rtcd_jax.problem import make_problem
 from rtcd_jax.search import cmaes
 from tests.analysis.disturb import comparisons
-from tests.paths import CONFIGS
+from tests.paths import CONFIGS, ROOT
 
 ON_DEVICE = {"cusolver_syevd_ffi", "Sharding", "SPMDFullToShardShape", "SPMDShardToFullShape"}
 """Calls that are a GPU library's or the partitioner's own."""
@@ -76,3 +78,18 @@ def test_disturbed_motions_ask_nothing_of_the_host(robots):
     with compiled_for("cuda"):
         traced = scenarios.advance.trace(robots.loops, lanes, motion, jnp.asarray(0), jax.random.key(0))
         assert calls(traced.lower(lowering_platforms=("cuda",)).as_text()) == set()
+
+
+@pytest.mark.slow
+def test_a_chunk_on_a_gpu_is_one_graph_that_never_waits_for_the_host(monkeypatch):
+    """Compiled for an H100 without one; `make gpu-budget` installs the compiler's wheels."""
+    bench = ROOT / "launch" / "bench"
+    if not (bench / ".wheels" / "nvidia").is_dir():
+        pytest.skip("the compiler's wheels are not here: make gpu-budget")
+    monkeypatch.syspath_prepend(str(bench))
+    budget = importlib.import_module("gpu_budget")
+    known = json.loads(budget.BUDGET.read_text())["pendulum_rtcd"]
+    row = budget.measure(CONFIGS / "pendulum_rtcd.yaml", 64, bench / ".wheels", budget.trips_of(known, 64))
+    assert row["graphs"] == 1 / 64
+    assert row["outside"] == row["syncs"] == row["slices_in_loops"] == 0
+    assert 0 < row["launches"] < 700

@@ -3,7 +3,7 @@
 XLA's whole GPU compiler runs on a CPU, given three wheels (224 MB, into a folder of their own) and the card's numbers
 (h100.txtpb). What it makes is counted: kernels and copies times the trips of the loops around them, CUDA graphs, what
 stands in a loop outside of a graph, temporaries, registers and spills. Nothing runs, so that nothing here is a time.
-Trips that depend on the numbers are those of `gpu_budget.json`, which has the budget, too.
+Trips that depend on the numbers are those of `gpu_budget.json` (measured by gpu_trips.py), which has the budget, too.
 """
 
 import argparse
@@ -212,6 +212,12 @@ def spills(folder: Path, dump: Path) -> tuple[int, int]:
     return registers, spilled
 
 
+def trips_of(budget: dict, chunk: int) -> dict[str, float]:
+    """Those of the largest measured chunk that is not larger, or of the smallest."""
+    measured = sorted(map(int, budget["trips"]))
+    return budget["trips"][str(max((size for size in measured if size <= chunk), default=measured[0]))]
+
+
 def measure(config: Path, chunk: int, folder: Path, trips: dict[str, float]) -> dict[str, float]:
     """One row of the table."""
     with tempfile.TemporaryDirectory() as place:
@@ -255,7 +261,7 @@ def main() -> None:
     for config in arguments.configs:
         budget = budgets[config]
         for chunk in arguments.chunks:
-            row = measure(CONFIGS / f"{config}.yaml", chunk, folder, budget["trips"])
+            row = measure(CONFIGS / f"{config}.yaml", chunk, folder, trips_of(budget, chunk))
             told = "  ".join(f"{name} {value:.4g}" for name, value in row.items())
             print(f"{config:16}{chunk:>7}  {told}", flush=True)
             over += [

@@ -47,6 +47,7 @@ class Measured:
     """rtcd_jax's pipeline for one population: compilation, repeated calls on fresh genomes, memory [bytes]."""
 
     population: int
+    device: str
     compilation: Timed
     calls: tuple[Timed, ...]
     with_funnel: float
@@ -55,9 +56,10 @@ class Measured:
     resident_peak: int
 
 
-def measure_pipeline(config: Path, population: int, repeats: int) -> Measured:
+def measure_pipeline(config: Path, population: int, repeats: int, rollouts: str | None = None) -> Measured:
     """Compile the evaluation of `population` genomes once, then time `repeats` calls, each with other genomes.
 
+    `rollouts` takes the place of the configuration's `funnel.rollouts`.
     Genomes are uniform in the unit box of the search. `with_funnel` is the share of candidates whose status is OK.
     """
     prepare_jax(1)
@@ -69,6 +71,9 @@ def measure_pipeline(config: Path, population: int, repeats: int) -> Measured:
     from rtcd_jax.types import Status
 
     settings = load(config)
+    if rollouts is not None:
+        funnel = settings.funnel.model_copy(update={"rollouts": rollouts})
+        settings = settings.model_copy(update={"funnel": funnel})
     evaluate = jax.jit(make_evaluate(make_problem(settings)))
     shape = population, sum(variable.free for variable in settings.variables().values())
     genomes = [jax.random.uniform(jax.random.key(i), shape) for i in range(repeats + 1)]
@@ -83,6 +88,7 @@ def measure_pipeline(config: Path, population: int, repeats: int) -> Measured:
         feasible += int((evaluations.status == Status.OK).sum())
     return Measured(
         population=population,
+        device=jax.devices()[0].device_kind,
         compilation=compilation,
         calls=tuple(calls),
         with_funnel=feasible / (repeats * population),

@@ -48,14 +48,19 @@ def main() -> None:
     parser.add_argument("--config", type=Path, default=CONFIG)
     parser.add_argument("--populations", type=int, nargs="+", default=[1, 64, 1024])
     parser.add_argument("--repeats", type=int, default=5, help="timed calls of each population")
+    parser.add_argument("--rollouts", choices=("closed_form", "mjx", "mixed"), help="instead of the configuration's")
     parser.add_argument("--results", type=Path, default=RESULTS, help="folder of the JSON file")
     arguments = parser.parse_args()
     with multiprocessing.get_context("spawn").Pool(1, maxtasksperchild=1) as fresh:
-        jobs = [(arguments.config, population, arguments.repeats) for population in arguments.populations]
+        jobs = [
+            (arguments.config, population, arguments.repeats, arguments.rollouts)
+            for population in arguments.populations
+        ]
         runs = fresh.starmap(measure_pipeline, jobs, chunksize=1)
     print_table(runs)
     record = {
         "config": arguments.config.name,
+        "rollouts": arguments.rollouts,
         **environment("jax", "jaxlib"),
         "runs": [asdict(run) | summary(run) for run in runs],
     }
