@@ -3,15 +3,17 @@
 "the paper" is Girlanda et al., ICRA 2024 (arXiv 2403.10966).
 """
 
+import contextlib
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from math import inf
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, cast
 
-from pydantic import Field, GetCoreSchemaHandler, SerializeAsAny
+from pydantic import BeforeValidator, Field, GetCoreSchemaHandler, SerializeAsAny
 from pydantic_core.core_schema import CoreSchema, no_info_plain_validator_function
 
-from rtcd_jax.config.settings import Settings, invalid
+from rtcd_jax.config.arithmetic import arithmetic
+from rtcd_jax.config.settings import Settings, invalid, refusal
 from rtcd_jax.system.errors import Problem, closest
 from rtcd_jax.volume import VOLUMES
 
@@ -79,12 +81,30 @@ def read_plant(data: Any) -> PlantConfig:
     return PLANTS[name].model_validate(data)
 
 
+def _number(value: Any) -> Any:
+    """A text as the number that it writes in arithmetic; all else, a quoted number too, as it is."""
+    if not isinstance(value, str):
+        return value
+    with contextlib.suppress(ValueError):
+        float(value)
+        return value
+    try:
+        return arithmetic(value, {})
+    except ValueError as error:
+        raise refusal(str(error)) from None
+
+
+ARITHMETIC = BeforeValidator(_number)
+"""Of the numbers of a task and of boxes: they may be written as arithmetic with pi."""
+Number = Annotated[float, ARITHMETIC]
+
+
 class Variable(Settings):
     """One searched number and its box."""
 
-    initial: float = Field(ge=-1e9, le=1e9, description=f"value of the initial candidate [{UNIT}]")
-    min: float = Field(ge=-1e9, le=1e9, description=f"lower end of the box [{UNIT}]")
-    max: float = Field(ge=-1e9, le=1e9, description=f"upper end of the box [{UNIT}]")
+    initial: Number = Field(ge=-1e9, le=1e9, description=f"value of the initial candidate [{UNIT}]")
+    min: Number = Field(ge=-1e9, le=1e9, description=f"lower end of the box [{UNIT}]")
+    max: Number = Field(ge=-1e9, le=1e9, description=f"upper end of the box [{UNIT}]")
     pinned: bool = Field(default=False, description="hold the initial value instead of searching")
 
     @property
@@ -100,8 +120,8 @@ class Variable(Settings):
 
 
 # Strictness is for the numbers: YAML's lists become tuples.
-Numbers = Annotated[tuple[Annotated[float, Field(ge=-1e6, le=1e6)], ...], Field(strict=False)]
-Limits = Annotated[tuple[Annotated[float, Field(ge=1e-6, allow_inf_nan=True)], ...], Field(strict=False)]
+Numbers = Annotated[tuple[Annotated[float, Field(ge=-1e6, le=1e6), ARITHMETIC], ...], Field(strict=False)]
+Limits = Annotated[tuple[Annotated[float, Field(ge=1e-6, allow_inf_nan=True), ARITHMETIC], ...], Field(strict=False)]
 LARGEST_LIMIT = 1e6
 Variables = Annotated[tuple[Variable, ...], Field(strict=False)]
 
