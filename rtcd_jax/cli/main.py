@@ -6,6 +6,7 @@ Nothing but the standard library is imported before a verb is known, and nothing
 import inspect
 import sys
 from collections.abc import Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass
 from importlib import import_module
 from typing import TYPE_CHECKING
@@ -43,11 +44,13 @@ class Verb:
         if not others:  # reads the words itself
             return function(words)
         options = first.annotation.read(words, f"rtcd {name}")
-        if self.jax:
-            prepare_jax(cache=getattr(options, "cache", None))
+        from rtcd_jax.system.compilation import announced
         from rtcd_jax.system.console import Console
 
-        with Console() as console:
+        if self.jax:
+            prepare_jax(cache=getattr(options, "cache", None))
+
+        with Console() as console, announced(console) if self.jax else nullcontext():
             code = function(options, console)
             if self.shown:
                 _refresh(options.run, console)

@@ -61,6 +61,7 @@ def on_cluster(
     """Joins the other processes of `machines`, if any, and does `work(console, cluster)`; only the first one speaks."""
     prepare_jax(machines.cpu_devices, machines.cache)
     from rtcd_jax.system.cluster import Cluster, Lost, Preempted, initialize, shutdown
+    from rtcd_jax.system.compilation import announced
 
     initialize(machines.coordinator, machines.num_processes, machines.process_id)  # before anything touches a device
     cluster = Cluster.of(machines.devices)
@@ -68,7 +69,8 @@ def on_cluster(
     speaker = console if cluster.first else silent()
     try:
         cluster.barrier()
-        work(speaker, cluster)
+        with announced(speaker):
+            work(speaker, cluster)
     except Preempted:
         speaker.message(f"asked to stop (SIGTERM): saved in {folder}; the same command goes on")
         shutdown()
@@ -117,7 +119,8 @@ def optimize(options: OptimizeOptions, console: Console) -> Exit:
         from rtcd_jax.run.optimize import optimize as run_optimize
 
         worked = run_optimize(options.config, options.run, console, cluster)
-        cluster.on_first(lambda: _finish_page(options.run, worked, console))
+        finish = partial(_finish_page, options.run, worked, console)
+        cluster.on_first(partial(cluster.heeding, finish))
 
     return on_cluster(options.machines, options.run, console, search)
 
@@ -179,7 +182,8 @@ def sweep(options: SweepOptions, console: Console) -> Exit:
             console.message(f"case {case.number} of 0 … {len(cases) - 1}: {case.folder}")
             try:
                 worked = run_optimize(case.config, case.folder, console, cluster)
-                cluster.on_first(partial(_finish_page, case.folder, worked, console))
+                finish = partial(_finish_page, case.folder, worked, console)
+                cluster.on_first(partial(cluster.heeding, finish))
             except UserError as error:  # the others may do better
                 console.message(f"case {case.number} ended early: {error}")
                 failed.append(case.folder.name)

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 from pathlib import Path
 
 import jax
@@ -62,7 +63,8 @@ def optimize(config: Config, folder: Path, console: Console, cluster: Cluster) -
         again = Reevaluation(problem, cluster, example, console)
         state, pace = begun, _Pace(config)
         try:
-            for state, generation in _first_announced(search.run(plan, evaluate, begun), console):
+            steps = search.run(plan, evaluate, begun)
+            for state, generation in iter(partial(cluster.heeding, partial(next, steps, None)), None):
                 run.append(vars(generation))
                 run.save_if_due(state, int(state.generation))
                 console.progress(pace.progress(generation))
@@ -71,7 +73,8 @@ def optimize(config: Config, folder: Path, console: Console, cluster: Cluster) -
             run.save(state, int(state.generation))
             raise
         run.save(state, int(state.generation))
-        *sampled, initial = again.sample([*_filled(state.elites), _initial(problem, evaluate)])
+        initial = cluster.heeding(partial(_initial, problem, evaluate))
+        *sampled, initial = again.sample([*_filled(state.elites), initial])
         best_first = _filled(search.finish(plan, state, _stacked(sampled, state.elites)))
         if not best_first:
             raise UserError(
@@ -81,17 +84,6 @@ def optimize(config: Config, folder: Path, console: Console, cluster: Cluster) -
         reported = again.report(best_first, initial)
         cluster.on_first(lambda: _store(problem, *reported, run, console))
         return True
-
-
-def _first_announced(
-    steps: Iterator[tuple[search.SearchState, search.Generation]], console: Console
-) -> Iterator[tuple[search.SearchState, search.Generation]]:
-    """The same steps; while the first one compiles, the console says so."""
-    with console.waiting("compiling and evaluating the first generation"):
-        first = next(steps, None)
-    if first is not None:
-        yield first
-        yield from steps
 
 
 class _Pace:

@@ -153,6 +153,9 @@ class _OnDevices(Generic[Result]):
         rows = [(evaluation, jax.random.key_data(key), np.asarray(samples)) for evaluation, key, samples in jobs]
         return self._cluster.split(jax.tree.map(lambda *leaves: np.stack(leaves), *rows))
 
+    def _rows(self, jobs: Any) -> Result:
+        return self._cluster.gathered(self._program.result()(jobs, ()))
+
     def __call__(self, jobs: Sequence[Job], tell: Callable[[int], None]) -> list[Result]:
         """The jobs' results; `tell` hears how many are done before each round over the devices and after the last."""
         devices = len(self._cluster.devices)
@@ -161,7 +164,7 @@ class _OnDevices(Generic[Result]):
             tell(len(results))
             batch = [*jobs[len(results) : len(results) + devices]]
             filled = batch + batch[-1:] * (devices - len(batch))
-            rows = self._cluster.gathered(self._program.result()(self._split(filled), ()))
+            rows = self._cluster.heeding(partial(self._rows, self._split(filled)))
             results += [row(rows, k) for k in range(len(batch))]
         tell(len(results))
         return results

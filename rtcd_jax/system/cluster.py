@@ -8,6 +8,7 @@ import contextlib
 import os
 import signal
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor, wait
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, TypeVar, final
@@ -22,6 +23,8 @@ from rtcd_jax.system.errors import UserError
 
 HEARTBEAT = 30
 """Seconds after which a process that is no longer heard of counts as lost."""
+POLL = 0.1
+"""Seconds between two looks at whether a process alone was asked to stop."""
 SPLIT, WHOLE = PartitionSpec("candidates"), PartitionSpec()
 
 Value = TypeVar("Value")
@@ -185,3 +188,15 @@ class Cluster:
         together = self.processes > 1 and step is not None and multihost_utils.reached_preemption_sync_point(step)
         if self._asked or together:
             raise Preempted
+
+    def heeding(self, work: Callable[[], Value]) -> Value:
+        """What `work` returns, done by a thread of its own: that may be inside XLA for minutes.
+
+        A process alone that is asked to stop meanwhile raises Preempted at once; what `work` still does is lost.
+        """
+        pool = ThreadPoolExecutor(1)
+        result = pool.submit(work)
+        pool.shutdown(wait=False)
+        while not wait([result], POLL).done:
+            self.raise_if_preempted()
+        return result.result()

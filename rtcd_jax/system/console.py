@@ -74,6 +74,8 @@ class Console:
     def __init__(self, stream: TextIO | None = None, terminal: Terminal | None = None):
         self._terminal = terminal or Terminal(file=stream or sys.stdout)
         self._bar: Bar | None = None
+        self.spoken = time.monotonic()
+        """When it said something last."""
 
     def __enter__(self) -> Self:
         return self
@@ -85,6 +87,7 @@ class Console:
 
     def message(self, text: str) -> None:
         """Lines that stay; on a terminal above the live one. They only show what they quote: no terminal obeys it."""
+        self.spoken = time.monotonic()
         self._terminal.print(printable_lines(text), soft_wrap=True, highlight=False, markup=False, emoji=False)
         self._terminal.file.flush()
 
@@ -93,6 +96,7 @@ class Console:
         if not self._terminal.is_terminal:
             self.message(now.text)
             return
+        self.spoken = time.monotonic()
         if self._bar is None:
             columns = BarColumn(bar_width=16), TextColumn("{task.description}", markup=False)
             self._bar = Bar(*columns, console=self._terminal, auto_refresh=False)

@@ -6,6 +6,7 @@ import re
 import shutil
 import signal
 import subprocess
+import sys
 import time
 from pathlib import Path
 
@@ -14,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from rtcd_jax.cli.exits import STOPPED, Exit
 from rtcd_jax.config import load as configuration
 from rtcd_jax.elite.records import elite_names, read_elite, read_generations
 from rtcd_jax.run import optimize as run
@@ -144,6 +146,40 @@ def test_a_killed_run_ends_as_if_nothing_had_happened(finished, small, tmp_path)
     assert code == 0, errors
     assert "going on after generation" in output
     assert contents(folder) == contents(finished)
+
+
+LONG = "--elites.trials", "100000000", "--search.generations", "1"
+"""Held-out samples for hours."""
+
+
+@pytest.mark.parametrize(("sent", "code"), [(signal.SIGTERM, Exit.PREEMPTED), (signal.SIGINT, Exit.INTERRUPTED)])
+def test_asked_to_stop_while_its_elites_are_sampled_again_a_run_ends_and_goes_on(small, tmp_path, sent, code):
+    """While their program compiles or is at work; at once, far within the limit. Both ask a start and its resume."""
+    for first in ("compiling", "going on after generation 1"):
+        process = small.start("optimize", small.config, "--run", tmp_path / "run", *LONG)
+        output = iter(process.stdout.readline, "")
+        assert any(first in line for line in output)
+        assert first != "compiling" or any(line.startswith("generation 1/1") for line in output)
+        time.sleep(3)
+        process.send_signal(sent)
+        told, errors = process.communicate(timeout=30)
+        assert process.returncode == code, told + errors
+        assert (f"saved in {tmp_path / 'run'}" if sent == signal.SIGTERM else STOPPED) in told + errors
+    assert not (tmp_path / "run" / "elites").exists()
+
+
+def test_asked_to_stop_while_it_compiles_a_run_ends_and_leaves_a_folder_that_goes_on(small, tmp_path):
+    environment = small.environment | {"JAX_COMPILATION_CACHE_DIR": str(tmp_path)}
+    command = [sys.executable, "-u", "-m", "rtcd_jax", "optimize", str(small.config), "--run", str(tmp_path / "run")]
+    process = subprocess.Popen(command, cwd=ROOT, env=environment, stdout=subprocess.PIPE, text=True)
+    assert any(line.startswith("compiling") for line in iter(process.stdout.readline, ""))
+    time.sleep(2)
+    process.send_signal(signal.SIGTERM)
+    output, _ = process.communicate(timeout=30)
+    assert process.returncode == Exit.PREEMPTED, output
+    assert "generation" not in output
+    code, output, errors = small.optimize(tmp_path / "run")
+    assert code == 0, errors
 
 
 @pytest.mark.slow

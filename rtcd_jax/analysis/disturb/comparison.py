@@ -1,6 +1,5 @@
 """The controllers that are compared, and their rollouts in batches, with progress."""
 
-import contextlib
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -67,10 +66,6 @@ class Meter:
         self._done = self._reported = 0.0
         self._clock = Clock()
 
-    def compiling(self) -> contextlib.AbstractContextManager[None]:
-        """Around a chunk of the rollouts: the first one compiles, which the console says until it is over."""
-        return contextlib.nullcontext() if self._done else self._console.waiting("compiling the rollouts")
-
     def tick(self, experiment: str, motions: float) -> None:
         """Counts `motions` more of an experiment as done."""
         self._done += motions
@@ -135,9 +130,8 @@ def _run_batch(
     motion, held = start(comparison.loops, batch), jnp.zeros(batch.loop.shape)
     final = held
     for first in range(0, total, CHUNK):
-        with meter.compiling():
-            motion = advance(comparison.loops, batch, motion, jnp.asarray(first), key)
-            final = comparison.loops.distance(batch.loop, motion.x)
+        motion = advance(comparison.loops, batch, motion, jnp.asarray(first), key)
+        final = comparison.loops.distance(batch.loop, motion.x)
         if first + CHUNK > total - watched:
             held = jnp.maximum(held, final)
         over = settles and first * STEP > quiet and bool(jnp.all(motion.left | (final <= FORGOTTEN * ARRIVED)))

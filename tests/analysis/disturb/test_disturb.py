@@ -2,8 +2,6 @@
 
 import json
 import shutil
-import time
-from functools import partialmethod
 
 import numpy as np
 import pytest
@@ -17,7 +15,7 @@ from rtcd_jax.analysis.disturb.scenarios import undisturbed
 from rtcd_jax.elite.closed_loop import runge_kutta, simulate
 from rtcd_jax.elite.records import read_elite, write_elite
 from rtcd_jax.elite.simulators import simulators_of
-from rtcd_jax.system.console import Console, silent
+from rtcd_jax.system.console import silent
 from rtcd_jax.system.errors import UserError
 from tests.consoles import Screen
 from tests.export.folders import run_folder
@@ -119,23 +117,6 @@ def test_batches_are_full_and_outcomes_are_as_many_as_lanes(pendulums):
     outcome = run(pendulums, rollouts, 0, "", Meter(silent(), 1), settles=True)
     assert outcome.final.shape == (259,)
     np.testing.assert_array_equal(outcome.final, outcome.final[0])
-
-
-def test_until_the_first_chunk_is_over_the_console_says_that_its_program_compiles(monkeypatch):
-    monkeypatch.setattr(Console, "waiting", partialmethod(Console.waiting, every=0.01))
-    screen = Screen()
-    meter = Meter(screen.console, 256)
-    with meter.compiling():
-        deadline = time.monotonic() + 20
-        while "compiling the rollouts  elapsed 0:0" not in screen.text and time.monotonic() < deadline:
-            time.sleep(0.01)
-    told = screen.text
-    assert "compiling the rollouts  elapsed 0:0" in told
-    meter.tick("impulse", 1)
-    told = screen.text
-    with meter.compiling():
-        time.sleep(0.05)
-    assert screen.text == told
 
 
 def test_an_initial_candidate_without_a_funnel_is_left_out(tmp_path):
