@@ -292,6 +292,36 @@ def test_what_cannot_be_simulated_is_told_in_a_line(certificate, content, tmp_pa
     assert len(err.splitlines()) == 1
 
 
+def scale(numbers, factor):
+    """Every number of nested lists, times a factor."""
+    if isinstance(numbers, list):
+        return [scale(each, factor) for each in numbers]
+    return (float.fromhex(numbers) * factor).hex()
+
+
+ABSURD = {
+    "gains": lambda claim: claim.update(K=scale(claim["K"], 1e300)),
+    "all of them": lambda claim: claim.update({key: scale(claim[key], 1e307) for key in ("x", "rates", "K", "u")}),
+    "limits": lambda claim: claim.update(bounds=["0x1p-1000"] * 2),
+    "a microsecond": lambda claim: claim.update(dt=(1e-6).hex()),
+    "a long interval": lambda claim: claim.update(dt=(999.0).hex()),
+    "the heaviest": lambda claim: claim["parameters"].update(m=(1e300).hex()),
+    "the lightest": lambda claim: claim["parameters"].update(m=(1e-300).hex()),
+}
+
+
+@pytest.mark.parametrize("change", ABSURD)
+def test_what_is_readable_and_absurd_is_falsified_or_told_in_a_line(change, content, tmp_path, capfd):
+    """In a bounded time, without a warning of numpy's, whose workers' would be on stderr. Infinite gains may be right."""
+    ABSURD[change](content["claim"])
+    path = tmp_path / "x.json"
+    path.write_text(json.dumps(resealed(content)))
+    code = cli.main(["falsify", str(path), "--rollouts", "50", "--workers", "1"])
+    err = capfd.readouterr().err
+    assert code in ((0, 1) if change == "gains" else (1, 2))
+    assert len(err.splitlines()) == (1 if code == 2 else 0), err
+
+
 def test_a_refusal_goes_from_process_to_process():
     refused = pickle.loads(pickle.dumps(check.Refused("goal", "no\n")))
     assert str(refused) == r"goal: no\n"

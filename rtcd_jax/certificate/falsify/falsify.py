@@ -12,6 +12,7 @@ import numpy as np
 
 from rtcd_jax.certificate.falsify.simulation import REPEATED, MotionResults, Motions
 from rtcd_jax.system.console import Clock, Console, Progress
+from rtcd_jax.system.errors import UserError
 from rtcd_jax.system.journal import Journal
 from rtcd_jax.system.processes import processes
 
@@ -76,7 +77,7 @@ def falsify_file(path: Path, rollouts: int, seed: int, workers: int, console: Co
     A journal beside the certificate keeps finished parts: after a kill the same command goes on.
 
     Raises:
-        UserError: no certificate, or a folder that cannot be written.
+        UserError: no certificate, one that cannot be simulated, or a folder that cannot be written.
     """
     motions = Motions.of(path)
     digest = hashlib.sha256(path.read_bytes()).hexdigest()
@@ -99,10 +100,24 @@ def falsify_file(path: Path, rollouts: int, seed: int, workers: int, console: Co
 
 
 def enough_steps(motions: Motions, seed: int) -> int:
-    """Steps an interval with which halved steps change a few hundred motions' |y| by `TOLERANCE` at most."""
+    """Steps an interval with which halved steps change a few hundred motions' |y| by `TOLERANCE` at most.
+
+    Raises:
+        UserError: with the most steps, too, the states are no numbers any more.
+    """
     steps = FEWEST
-    while steps < MOST and motions.follow(PILOT, steps, np.random.default_rng(seed)).error > TOLERANCE:
+    while True:
+        pilot = motions.follow(PILOT, steps, np.random.default_rng(seed))
+        if pilot.error <= TOLERANCE:
+            return steps
+        if steps == MOST:
+            break
         steps *= 2
+    if not np.isfinite([pilot.error, *pilot.level, *pilot.growth]).all():
+        raise UserError(
+            f"the motions of this certificate cannot be simulated: with {steps} steps an interval they leave the range "
+            "of doubles; `rtcd check` says whether it proves anything"
+        )
     return steps
 
 

@@ -31,6 +31,8 @@ COARSER = 4
 """Steps in the goal region are so many times longer: there |y| falls fast, and its growth alone is judged."""
 TOGETHER = 0.2
 """Time [s] between two searches for motions that have arrived."""
+SETTLING = LONGEST / 1e5, TOGETHER / 2
+"""Lengths [s] of a step in the goal region, however long a knots' interval is."""
 
 Input = Callable[[float, np.ndarray], np.ndarray]
 """Time [s], states [n M] -> u [M]."""
@@ -90,6 +92,7 @@ class Motions:
         self.end = len(self._u) * self.dt
 
     @classmethod
+    @np.errstate(all="ignore")
     def of(cls, path: Path) -> "Motions":
         """Of a certificate's file.
 
@@ -103,6 +106,7 @@ class Motions:
         except (Refused, Undecided, KeyError, TypeError, RecursionError, OverflowError, LinAlgError) as error:
             raise UserError(f"{path} is no certificate ({error}): `rtcd check` says more") from None
 
+    @np.errstate(all="ignore")  # what is absurd shows in the results
     def follow(self, count: int, steps: int, random: np.random.Generator) -> MotionResults:
         """`count` motions to the goal, by `steps` steps an interval.
 
@@ -142,7 +146,7 @@ class Motions:
 
     def _settle(self, flight: "_Flight", steps: int) -> tuple[np.ndarray, np.ndarray]:
         """Whether every motion arrives, and the largest growth of |y| in one step."""
-        count, step = flight.x.shape[1], COARSER * self.dt / steps
+        count, step = flight.x.shape[1], float(np.clip(COARSER * self.dt / steps, *SETTLING))
         arrived, growth = np.zeros(count, bool), np.zeros(count)
         moving = np.arange(count)
         for _ in range(round(LONGEST / TOGETHER)):
@@ -214,7 +218,8 @@ class _Flight:
         self.level[who] = np.maximum(self.level[who], level)
         self.measure_limits(self.x[:, who], who)
         if finer.size:
-            self.error = max(self.error, float(np.max(np.abs(level[-who.start % REPEATED :: REPEATED] - finer))))
+            difference = np.max(np.abs(level[-who.start % REPEATED :: REPEATED] - finer))
+            self.error = float(np.maximum(self.error, difference))  # a NaN stays one
 
     def measure_limits(self, x: np.ndarray, who: Any) -> None:
         if self._limited.any():
