@@ -27,7 +27,7 @@ step() {   # step NAME COMMAND…: its output in NAME.log, a line in steps.jsonl
   local name=$1 code begin=$EPOCHREALTIME
   shift
   echo "$name: $*"
-  JAX_PLATFORMS=$platform timeout "$seconds" "$@" >"$results/$name.log" 2>&1
+  JAX_PLATFORMS=$platform timeout --kill-after=30 "$seconds" "$@" >"$results/$name.log" 2>&1
   code=$?
   printf '{"step": "%s", "exit": %d, "seconds": %.2f}\n' \
     "$name" "$code" "$(awk "BEGIN {print ${EPOCHREALTIME/,/.} - ${begin/,/.}}")" | tee -a "$results/steps.jsonl"
@@ -48,7 +48,7 @@ resume() {
   local command=("$python" -m rtcd_jax optimize) words
   read -ra words <<<"$resumed"
   command+=("${words[@]}" --run "$scratch/resumed")
-  JAX_PLATFORMS=cpu "${command[@]}" >"$results/on_cpu.log" 2>&1 &
+  JAX_PLATFORMS=cpu timeout --kill-after=30 "$seconds" "${command[@]}" >"$results/on_cpu.log" 2>&1 &
   local process=$! lines=0 code
   while kill -0 "$process" 2>/dev/null && ((lines < 3)); do
     sleep 1

@@ -167,6 +167,8 @@ def counted(root: Thunk, trips: dict[str, float]) -> Counter:
             if child.kind == "kCommandBuffer":
                 total += Counter(graphs=1) + of(child, True, in_loop)
             elif child.kind == "kWhile":
+                if child.trips is None and child.source not in trips:
+                    raise SystemExit(f"{BUDGET.name} has no trips of the loop of {child.source or 'an unknown file'}")
                 times = child.trips if child.trips is not None else trips[child.source]
                 body, condition = of(child, in_graph, True), of(Thunk("", 0, child.condition), in_graph, True)
                 once = body + condition + Counter(syncs=int(not in_graph and child.trips is None))
