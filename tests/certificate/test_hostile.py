@@ -312,7 +312,7 @@ ABSURD = {
 
 @pytest.mark.parametrize("change", ABSURD)
 def test_what_is_readable_and_absurd_is_falsified_or_told_in_a_line(change, content, tmp_path, capfd):
-    """In a bounded time, without a warning of numpy's on the workers' stderr. Infinite gains may be right."""
+    """In a bounded time, without a warning of numpy's on the workers' stderr. Large gains may be right."""
     ABSURD[change](content["claim"])
     path = tmp_path / "x.json"
     path.write_text(json.dumps(resealed(content)))

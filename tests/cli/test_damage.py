@@ -2,6 +2,7 @@
 
 import io
 import json
+import random
 import shutil
 from pathlib import Path
 
@@ -12,6 +13,7 @@ from rtcd_jax.cli import main as cli
 from rtcd_jax.run.folder import RunFolder
 from rtcd_jax.system.cluster import Cluster
 from rtcd_jax.system.errors import UserError
+from tests.analysis.replay.test_measured import ONE_JOINT, mutated
 from tests.analysis.report.runs import verify_and_disturb
 from tests.search.search_driver import begin, drive, experiment, plan_of
 
@@ -136,6 +138,27 @@ def test_many_damaged_runs_are_read_or_refused(verb, whole, capsys):
     with capsys.disabled():
         print(verb, {code: codes.count(code) for code in sorted(set(codes))})
     assert {0, 2} <= set(codes)
+
+
+@pytest.mark.slow
+def test_a_thousand_mutated_measurements_are_replayed_or_refused(whole, capsys):
+    """The whole verb, on files of every layout that labs measure."""
+    rng, codes = random.Random(3), []
+    shapes = [text.split("\n") for text in ONE_JOINT.values() if text.count("\n") == 1]
+    for number in range(1000):
+        head, row = shapes[number % len(shapes)]
+        rows = [row.format(t=k / 10, c=0.1 * k, p=0.3 * k, w=0, v=k) for k in range(6)]
+        Path("lab.csv").write_bytes(mutated("\n".join([head, *rows]).encode(), rng))
+        codes.append(cli.main(["replay", str(whole), "lab.csv"]))
+        out, err = capsys.readouterr()
+        case = f"file {number}: {codes[-1]} {err}"
+        assert codes[-1] in (0, 1, 2), case
+        assert "Traceback" not in out + err, case
+        assert len(err.splitlines()) == (1 if codes[-1] == 2 else 0), case
+        assert all(line.isprintable() for line in (out + err).splitlines()), case
+    with capsys.disabled():
+        print("replay", {code: codes.count(code) for code in sorted(set(codes))})
+    assert {1, 2} <= set(codes)
 
 
 def resume_damaged(whole, config, seed):
