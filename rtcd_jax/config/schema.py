@@ -261,7 +261,7 @@ class UncertaintyConfig(Settings):
         description="|w(t)| of a disturbance on the motors' axes, any function of time [input's unit]",
     )
     noise: Annotated[tuple[Annotated[float, Field(ge=0, le=1e9)], ...], Field(strict=False)] = Field(
-        default=(), description=f"largest errors of the measured states; empty: none [{UNIT}]"
+        default=(), description="largest errors of the measured states; empty: none [states' units]"
     )
     age: float = Field(
         default=0.0, ge=0, le=10, description="age of the oldest measurement that acts: hold and delay [s]"

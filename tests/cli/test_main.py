@@ -59,7 +59,8 @@ def keys(tree, path=""):
     branches = tree.items() if isinstance(tree, dict) else enumerate(tree)
     for name, branch in branches:
         key = f"{path}{name}"
-        nested = isinstance(branch, dict) or (isinstance(branch, list) and isinstance(branch[0], dict))
+        first = branch[0] if isinstance(branch, list) and branch else branch
+        nested = isinstance(first, dict) and bool(first)
         yield from keys(branch, f"{key}.") if nested else [key]
 
 
