@@ -39,10 +39,10 @@ def announced(console: Console, every: float = WAITING, patience: float = PATIEN
 
     def watch() -> None:
         with contextlib.ExitStack() as filtered:
-            waiting = False
+            first, waiting = time.monotonic(), False
             while not over.wait(min(_TICK, every, patience)):
                 now = time.monotonic()
-                first = min([*begun.values()], default=now)
+                first = min([first, *begun.values()]) if begun else now
                 if now - max(first, console.spoken) >= every:
                     console.message(f"compiling  elapsed {duration(now - first)}")
                 if (now - first >= patience) != waiting:
