@@ -40,7 +40,7 @@ def search_budget(problem: Problem) -> SamplingBudget:
     funnel = problem.config.funnel
     share = rollout.mjx(problem.plant) if funnel.rollouts == "mixed" else None
     physics = _physics(problem)
-    return SamplingBudget(funnel, Dynamics(physics, physics, share), rounds=2, uncertainty=problem.uncertainty)
+    return SamplingBudget(funnel, Dynamics(physics, physics, share), rounds=2)
 
 
 def elite_budget(problem: Problem) -> SamplingBudget:
@@ -50,12 +50,7 @@ def elite_budget(problem: Problem) -> SamplingBudget:
     physics = _physics(problem)
     funnel = problem.config.funnel.model_copy(update=counts)
     return SamplingBudget(
-        funnel,
-        Dynamics(physics, physics),
-        rounds=40,
-        samples_per_knot=elites.trials,
-        batch=path_batch(),
-        uncertainty=problem.uncertainty,
+        funnel, Dynamics(physics, physics), rounds=40, samples_per_knot=elites.trials, batch=path_batch()
     )
 
 

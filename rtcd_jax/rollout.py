@@ -56,20 +56,20 @@ def mjx(plant: Plant) -> Dynamics:
 
 class TrackingData(NamedTuple):
     """Feed-forward and gain schedule: what the controller looks up at both ends and the middle of every Runge-Kutta
-    step. Leading axes are (step, stage). `costs` are S(t), `rates` those of x*(t), for opponents.
+    step. Leading axes are (step, stage). For opponents, where the problem has an uncertainty: S(t) and the rates of
+    x*(t).
     """
 
     states: Float[Array, "steps 3 n intervals"]
     gains: Float[Array, "steps 3 m n intervals"]
-    costs: Float[Array, "steps 3 n n intervals"]
-    rates: Float[Array, "steps 3 n intervals"]
     inputs: Float[Array, "m intervals"]
     step: Float[Array, ""]
+    others: tuple[Float[Array, "steps 3 n n intervals"], Float[Array, "steps 3 n intervals"]] | None
 
     def part(self, which: Int[Array | np.ndarray, " chosen"]) -> "TrackingData":
         """The intervals `which`."""
-        states, gains, costs, rates, inputs, step = self
-        return TrackingData(*(table[..., which] for table in (states, gains, costs, rates, inputs)), step=step)
+        tables = jax.tree.map(lambda table: table[..., which], self._replace(step=None))
+        return tables._replace(step=self.step)
 
 
 def tracking_data(problem: Problem, candidate: Candidate, policy: Policy, steps: int) -> TrackingData:
@@ -84,16 +84,17 @@ def tracking_data(problem: Problem, candidate: Candidate, policy: Policy, steps:
         at_knots = jnp.moveaxis(table, 0, -1)[None]
         return (at_knots[..., :-1] * (1 - shares) + at_knots[..., 1:] * shares)[stages]
 
-    states = motion.at(grid)
-    inputs = jnp.broadcast_to(motion.inputs[..., None], (problem.plant.m, *states.shape[1:]))
-    rates = problem.plant.dynamics(candidate.design, states, inputs)
+    states, others = motion.at(grid), None
+    if problem.uncertainty is not None:
+        inputs = jnp.broadcast_to(motion.inputs[..., None], (problem.plant.m, *states.shape[1:]))
+        rates = problem.plant.dynamics(candidate.design, states, inputs)
+        others = linear(policy.values), jnp.moveaxis(rates, -1, 0)[stages]
     return TrackingData(
         states=jnp.moveaxis(states, -1, 0)[stages],
         gains=linear(policy.gains),
-        costs=linear(policy.values),
-        rates=jnp.moveaxis(rates, -1, 0)[stages],
         inputs=motion.inputs,
         step=policy.trajectory.dt / steps,
+        others=others,
     )
 
 
@@ -114,20 +115,19 @@ def roll_intervals(
 
     def step(carry, stage):
         x, peak = carry
-        states, gains, *others = stage
+        states, gains, others = stage
 
         def slope(x, place):
             error = [a - align(b) for a, b in zip(x, states[place], strict=True)]
             gain = align(gains[place])
             asked = feedforward - _feedback(gain, error)
-            cost, rate = [align(table[place]) for table in others] or (None, None)
+            cost, rate = jax.tree.map(lambda table: align(table[place]), others or (None, None))
             return _rate(dynamics, candidate, Situation(x, error, asked, gain, cost, rate, bounds))
 
         x = _step(slope, x, tracking.step, dynamics.large)
         return (x, jnp.maximum(peak, _fill(x, limits))), None
 
-    others = () if dynamics.opponent is None else (tracking.costs, tracking.rates)
-    tables = tracking.states, tracking.gains, *others
+    tables = tracking.states, tracking.gains, None if dynamics.opponent is None else tracking.others
     start = split(x)
     (ends, peak), _ = short_scan(step, (start, _fill(start, limits)), tables)
     return jnp.stack(ends), peak

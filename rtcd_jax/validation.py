@@ -24,7 +24,7 @@ from rtcd_jax.numerics import sampling
 from rtcd_jax.numerics.ellipsoid import Ellipsoids
 from rtcd_jax.numerics.loops import packed_scan
 from rtcd_jax.problem import Problem
-from rtcd_jax.types import Candidate, Policy, Status, Uncertainty
+from rtcd_jax.types import Candidate, Policy, Status
 
 SAFETY = 0.98
 """Level over that of the lowest held-out sample that failed."""
@@ -55,7 +55,6 @@ class SamplingBudget:
     rounds: int
     samples_per_knot: int = 0
     batch: int = 2048
-    uncertainty: Uncertainty | None = None
 
 
 class Rollouts(NamedTuple):
@@ -179,7 +178,7 @@ def validate_paths(
     batch = min(budget.batch, knots * most)
     last_count = jnp.asarray(most if samples_per_knot is None else samples_per_knot, int)
     first_count = jnp.asarray(min(budget.funnel.trials, most), int)
-    plant, uncertainty = rollouts.problem.plant, budget.uncertainty
+    plant, uncertainty = rollouts.problem.plant, rollouts.problem.uncertainty
 
     # Without a funnel no round would ever be clean.
     hopeful = (rollouts.policy.status == Status.OK) & jnp.all(jnp.isfinite(levels) & (levels > 0))

@@ -33,14 +33,11 @@ class Nothing(eqx.Module):
     """The design of a robot that has none."""
 
 
-@final
-class Unstable(Plant):
-    """x1'' = 4 x1 + u: an inverted pendulum about the upright."""
+class Equations(Plant):
+    """A robot that is its equations alone: no design, no MJCF, one force."""
 
-    limit: float = UNBOUNDED
+    limit: float
 
-    state_names: ClassVar = ("position", "speed")
-    state_units: ClassVar = ("m", "m/s")
     input_names: ClassVar = ("force",)
     input_units: ClassVar = ("N",)
     design_units: ClassVar = {}
@@ -51,21 +48,31 @@ class Unstable(Plant):
     def input_limit(self):
         return (self.limit,)
 
-    def dynamics(self, design, x, u):
-        return jnp.stack([x[1], 4 * x[0] + u[0]])
-
-    def energy(self, design, x):
-        return 0.5 * x[1] ** 2 - 2 * x[0] ** 2
-
     def parameters(self, design):
         return {"limit": self.limit}
 
     @classmethod
     def from_parameters(cls, parameters):
-        return cls(parameters["limit"]), Nothing()
+        return cls(limit=parameters["limit"]), Nothing()
 
     def edit_model(self, design):
         return {}
+
+
+@final
+class Unstable(Equations):
+    """x1'' = 4 x1 + u: an inverted pendulum about the upright."""
+
+    limit: float = UNBOUNDED
+
+    state_names: ClassVar = ("position", "speed")
+    state_units: ClassVar = ("m", "m/s")
+
+    def dynamics(self, design, x, u):
+        return jnp.stack([x[1], 4 * x[0] + u[0]])
+
+    def energy(self, design, x):
+        return 0.5 * x[1] ** 2 - 2 * x[0] ** 2
 
 
 def problem_of(state_limits, limit=UNBOUNDED, intervals=10, **funnel) -> Problem:

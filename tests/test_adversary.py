@@ -3,10 +3,8 @@
 import dataclasses
 import itertools
 from functools import cache, partial
-from pathlib import Path
 from typing import ClassVar, final
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -18,11 +16,11 @@ from rtcd_jax.adversary import Drawn, Situation, Worst, scaled_rate
 from rtcd_jax.config import load as configuration
 from rtcd_jax.evaluation import search_budget
 from rtcd_jax.funnel import MARGIN, estimate_funnel
-from rtcd_jax.plants.base import Plant
 from rtcd_jax.problem import Problem
 from rtcd_jax.types import Candidate, Policy, Status, Trajectory, Uncertainty
 from rtcd_jax.validation import Dynamics, Rollouts, SamplingBudget, validate_paths
 from tests import pipeline
+from tests.linear_system import Equations, Nothing
 
 
 def uncertainty(residual=0.5, noise=(0.0, 0.0), age=0.0, input_limit=0.0, input=0.0, **parameters) -> Uncertainty:
@@ -36,49 +34,26 @@ def uncertainty(residual=0.5, noise=(0.0, 0.0), age=0.0, input_limit=0.0, input=
 
 
 @final
-class Nothing(eqx.Module):
-    """The design of a robot that has none."""
-
-
-@final
-class Scalar(Plant):
+class Scalar(Equations):
     """x' = -x + cubic x^3 + u"""
 
     cubic: float = 0.0
+    limit: float = 1.0
 
     state_names: ClassVar = ("x",)
     state_units: ClassVar = ("m",)
-    input_names: ClassVar = ("u",)
-    input_units: ClassVar = ("N",)
-    design_units: ClassVar = {}
-    Design: ClassVar = Nothing
-    mjcf: ClassVar = Path("none")
-
-    @property
-    def input_limit(self):
-        return (1.0,)
 
     def dynamics(self, design, x, u):
         return jnp.stack([-x[0] + self.cubic * x[0] ** 3 + u[0]])
 
     def energy(self, design, x):
-        return x[0]
-
-    def parameters(self, design):
-        return {}
-
-    @classmethod
-    def from_parameters(cls, parameters):
-        return cls(), Nothing()
-
-    def edit_model(self, design):
-        return {}
+        return 0.5 * x[0] ** 2
 
 
 def scalar_funnel(cubic: float, limit: float, may: Uncertainty):
     """That of the uncontrolled system at rest, within |x| <= limit."""
     data = yaml.safe_load(configuration.EXAMPLE) | {"trajectory": {"knots": 4}}
-    plant = Scalar(cubic)
+    plant = Scalar(cubic=cubic)
     problem = Problem(
         configuration.parse(data), plant, np.zeros(1), np.zeros(1), np.array([limit]), np.ones(1), (), may
     )  # fmt: skip
@@ -209,8 +184,9 @@ def test_robots_of_the_box_stay_and_others_are_found_out(factor, bears):
     @jax.jit
     def validated(may):
         physics = rollout.closed_form(problem.plant)
-        rollouts = Rollouts.of(problem, nominal.candidate, nominal.funnel.policy, problem.config.funnel)
-        budget = SamplingBudget(problem.config.funnel, Dynamics(physics, physics), 1, 400, 900, uncertainty=may)
+        robust = dataclasses.replace(problem, uncertainty=may)
+        rollouts = Rollouts.of(robust, nominal.candidate, nominal.funnel.policy, problem.config.funnel)
+        budget = SamplingBudget(problem.config.funnel, Dynamics(physics, physics), 1, 400, 900)
         return validate_paths(rollouts, levels, jax.random.key(1), budget)
 
     after, samples = validated(BOX.times(factor))

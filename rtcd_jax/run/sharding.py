@@ -73,8 +73,8 @@ def sharded(
     return evaluate_all
 
 
-def _summary(cluster: Cluster, part: Evaluation) -> tuple[np.ndarray, Volumes]:
-    """Statuses and volumes, but those of the knots, on the host as soon as the chunk is done."""
+def _summary(cluster: Cluster, part: Evaluation) -> tuple[np.ndarray, Volumes, np.ndarray | None]:
+    """Statuses, volumes but those of the knots, and what is borne, on the host as soon as the chunk is done."""
     done = cast(Any, part.status).is_ready
     while not done():
         time.sleep(POLL)

@@ -131,7 +131,8 @@ def step(plan: Plan, evaluate: Evaluate, state: SearchState) -> tuple[SearchStat
     strategy, points, genomes = _ask(plan, state.strategy, draw)
     evaluation = evaluate(genomes, directions)
     summary = _Summary.of(evaluation, plan.settings.objective)
-    strategy, stops = _tell(plan, strategy, points, summary.costs, anew)
+    graded = elites.graded_cost(evaluation, plan.settings.objective)
+    strategy, stops = _tell(plan, strategy, points, graded, anew)
     after = SearchState(
         strategy=strategy,
         elites=elites.merge(

@@ -1,5 +1,6 @@
 import dataclasses
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -51,6 +52,22 @@ def test_the_search_finds_the_known_optimum(mode):
     final, last = all_of(plan(mode, generations=60))[-1]
     assert last.best_so_far > 99.5
     np.testing.assert_allclose(final.elites.evaluation.genome[0], PEAK, atol=0.08)
+
+
+@both_modes
+def test_what_bears_more_knots_ranks_better_where_nothing_is_feasible(mode):
+    """The search comes to the only funnels there are, although no first candidate has one."""
+
+    def narrow(genomes, key):
+        distance = jnp.linalg.norm(genomes - PEAK, axis=1)
+        feasible = distance < 0.1
+        evaluation = population(genomes, 1 - distance, jnp.where(feasible, Status.OK, Status.FUNNEL_EMPTY))
+        borne = jnp.where(feasible, 1.0, 1 - distance / 2)
+        return eqx.tree_at(lambda e: e.funnel.borne, evaluation, borne, is_leaf=lambda leaf: leaf is None)
+
+    searched = [generation for _, generation in all_of(plan(mode, generations=40, sigma=0.1), narrow)]
+    assert searched[0].feasible == 0
+    assert searched[-1].best_so_far > 0.9
 
 
 @both_modes
