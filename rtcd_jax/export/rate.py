@@ -72,7 +72,8 @@ class ControlRate:
         failed = f"; a share of {', '.join(failing)} failed" if failing else ""
         if self.divisor is None:
             return f"no tried rate suffices for {states}{failed}"
-        return f"{self.rate:.4g} Hz, every {self.period:.6g} s = dt/{self.divisor}, suffices for {states}{failed}"
+        rate = f"{self.rate:.4g} Hz, every {self.period:.6g} s = dt/{self.divisor}, with a call at every knot,"
+        return f"{rate} suffices for {states}{failed}"
 
 
 def control_rate(
