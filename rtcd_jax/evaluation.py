@@ -17,7 +17,7 @@ from rtcd_jax.funnel import estimate_funnel
 from rtcd_jax.genome import decode
 from rtcd_jax.numerics.interior_point import CACHE, VECTOR
 from rtcd_jax.numerics.loops import on_gpu
-from rtcd_jax.policy import stabilize
+from rtcd_jax.policy import input_jumps, stabilize
 from rtcd_jax.problem import Problem
 from rtcd_jax.system.devices import path_batch
 from rtcd_jax.trajectory import plan
@@ -162,4 +162,5 @@ def _with_funnel(
     samples_per_knot: Int[Array, ""] | int | None = None,
 ) -> Evaluation:
     funnel = estimate_funnel(problem, candidate, policy, key, budget, samples_per_knot)
-    return Evaluation(genome, candidate, funnel, funnel_volume(funnel), funnel.status)
+    volumes = funnel_volume(funnel, input_jumps(problem, candidate, policy.trajectory))
+    return Evaluation(genome, candidate, funnel, volumes, funnel.status)

@@ -66,6 +66,13 @@ def linearize(
     return both[:, :n], both[:, n:]
 
 
+def input_jumps(problem: Problem, candidate: Candidate, trajectory: Trajectory) -> Float[Array, "knots n m"]:
+    """B at the knots: by how much the state jumps for a unit impulse on each input [1/(input's unit s)]."""
+    at_rest = jnp.zeros_like(trajectory.us[:1])
+    _, b = linearize(problem, candidate, trajectory.xs.T, jnp.concatenate([trajectory.us, at_rest]).T)
+    return jnp.moveaxis(b, -1, 0)
+
+
 def stabilize(problem: Problem, candidate: Candidate, trajectory: Trajectory) -> Policy:
     """The LQR about a trajectory; RICCATI_INDEFINITE if a value matrix lost positive definiteness."""
     substeps = problem.config.trajectory.substeps

@@ -1,4 +1,7 @@
-"""Funnel -> volumes: exact ellipsoid volumes v_k = pi^(n/2) / Gamma(n/2 + 1) rho_k^(n/2) / sqrt(det S_k).
+"""Funnel -> volumes: exact ellipsoid volumes v_k = pi^(n/2) / Gamma(n/2 + 1) rho_k^(n/2) / sqrt(det S_k), and pushes.
+
+A push is an impulse J on one input [input's unit s], by which the state jumps by b J, b the input's column of B. It
+leaves x*(t_k) inside B_k for |J| <= sqrt(rho_k / (b' S_k b)).
 
 `VOLUMES` is the one list of what is made of them: a search maximizes any, records, tables and pages show all. The
 configuration and the report read it without JAX, which is imported where it is needed.
@@ -8,33 +11,58 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 if TYPE_CHECKING:
+    from jaxtyping import Array, Float
+
     from rtcd_jax.types import Funnel, Volumes
 
 
-class Volume(NamedTuple):
-    """A number of the knots' ellipsoid volumes v [N+1], in the product of the states' units times `seconds` [s].
+class Knots(NamedTuple):
+    """What the numbers of a funnel are made of, in arrays of JAX or numpy."""
 
-    `of(v, logs, dt)` is its formula, for arrays of JAX or numpy; `logs` are the logarithms of v.
+    v: Any
+    """Volumes of the ellipsoids [N+1], in the product of the states' units."""
+    logs: Any
+    """Their logarithms."""
+    pushes: Any
+    """Largest impulse on each input [N+1 m], in its unit times seconds."""
+    dt: Any
+    """Of an interval [s]."""
+
+
+class Volume(NamedTuple):
+    """A number of a funnel's `Knots`, made by `of`.
+
+    Its unit is the product of the states' units times `seconds` [s] or, of a `push`, the input's unit times [s].
     """
 
     meaning: str
-    of: Callable[[Any, Any, Any], Any]
+    of: Callable[[Knots], Any]
     seconds: int = 0
+    push: bool = False
 
 
 VOLUMES = {
-    "sum": Volume("v_0 + … + v_N, the paper's", lambda v, logs, dt: v.sum()),
-    "integral": Volume("trapezoid rule over time", lambda v, logs, dt: dt * ((v[1:] + v[:-1]).sum() / 2), seconds=1),
-    "inlet": Volume("v_0 of the initial ellipsoid", lambda v, logs, dt: v[0]),
+    "sum": Volume("v_0 + … + v_N, the paper's", lambda at: at.v.sum()),
+    "integral": Volume("trapezoid rule over time", lambda at: at.dt * ((at.v[1:] + at.v[:-1]).sum() / 2), seconds=1),
+    "inlet": Volume("v_0 of the initial ellipsoid", lambda at: at.v[0]),
     "geometric_mean": Volume(
         "(v_0 … v_N)^(1 / (N+1)), which an empty knot brings to zero",
-        lambda v, logs, dt: logs.__array_namespace__().exp(logs.mean()),
+        lambda at: at.logs.__array_namespace__().exp(at.logs.mean()),
+    ),
+    "push": Volume(
+        "push margin: the largest impulse on any input, at any knot, that leaves x* + B J in the funnel",
+        lambda at: at.pushes.min(),
+        push=True,
     ),
 }
 
 
-def funnel_volume(funnel: "Funnel") -> "Volumes":
-    """All `VOLUMES`, zero for a funnel whose status is not OK."""
+LATER = ("push",)
+"""Those that older runs lack."""
+
+
+def funnel_volume(funnel: "Funnel", jumps: "Float[Array, 'knots n m']") -> "Volumes":
+    """All `VOLUMES`, zero for a funnel whose status is not OK; `jumps` are `policy.input_jumps`."""
     import jax.numpy as jnp
 
     from rtcd_jax.numerics.batched import cholesky
@@ -42,6 +70,14 @@ def funnel_volume(funnel: "Funnel") -> "Volumes":
     from rtcd_jax.types import Status, Volumes
 
     factor, _ = cholesky(jnp.moveaxis(funnel.policy.values, 0, -1))
-    logs = jnp.where(funnel.status == Status.OK, log_volume(factor, funnel.levels), -jnp.inf)
-    per_knot, dt = jnp.exp(logs), funnel.policy.trajectory.dt
-    return Volumes(per_knot, {name: volume.of(per_knot, logs, dt) for name, volume in VOLUMES.items()})
+    whole = funnel.status == Status.OK
+    logs = jnp.where(whole, log_volume(factor, funnel.levels), -jnp.inf)
+    pushes = jnp.where(whole, largest_pushes(funnel.policy.values, funnel.levels, jumps), 0)
+    at = Knots(jnp.exp(logs), logs, pushes, funnel.policy.trajectory.dt)
+    return Volumes(at.v, {name: volume.of(at) for name, volume in VOLUMES.items()})
+
+
+def largest_pushes(values: Any, levels: Any, jumps: Any) -> Any:
+    """sqrt(rho_k / (b' S_k b)) [N+1 m] for S [N+1 n n], rho [N+1] and b [N+1 n m], in arrays of JAX or numpy."""
+    grown = ((values[:, :, :, None] * jumps[:, None]).sum(2) * jumps).sum(1)
+    return (levels[:, None] / grown) ** 0.5

@@ -12,6 +12,7 @@ from rtcd_jax.evaluation import make_evaluate, resample, search_budget
 from rtcd_jax.funnel import MARGIN
 from rtcd_jax.genome import decode
 from rtcd_jax.numerics.ellipsoid import Ellipsoids
+from rtcd_jax.policy import input_jumps
 from rtcd_jax.types import Status
 from rtcd_jax.volume import funnel_volume
 from tests import pipeline
@@ -41,7 +42,13 @@ def test_the_parts_of_an_evaluation_belong_together():
     np.testing.assert_array_equal(evaluation.genome, pipeline.genomes())
     decoded = jax.jit(jax.vmap(lambda genome: decode(pipeline.problem(), genome)))(pipeline.genomes())
     assert_close(evaluation.candidate, decoded, rtol=1e-14)
-    assert_close(evaluation.volumes, jax.jit(jax.vmap(funnel_volume))(evaluation.funnel), rtol=1e-13)
+
+    @jax.jit
+    @jax.vmap
+    def volumes(candidate, funnel):
+        return funnel_volume(funnel, input_jumps(pipeline.problem(), candidate, funnel.policy.trajectory))
+
+    assert_close(evaluation.volumes, volumes(evaluation.candidate, evaluation.funnel), rtol=1e-13)
     np.testing.assert_array_equal(evaluation.status, evaluation.funnel.status)
     statuses = [Status.OK] * 5
     statuses[pipeline.HARD] = Status.FUNNEL_EMPTY

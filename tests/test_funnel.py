@@ -250,7 +250,7 @@ def _estimated(problem, evaluation, budget: SamplingBudget):
     @jax.vmap
     def estimate(candidate, policy):
         funnel = estimate_funnel(problem, candidate, policy, pipeline.GENERATION, budget)
-        return funnel.levels, funnel_volume(funnel)["sum"]
+        return funnel.levels, funnel_volume(funnel, jnp.ones((funnel.levels.shape[0], 2, 1)))["sum"]
 
     assert np.all(np.asarray(evaluation.status) == Status.OK)
     return tuple(np.asarray(leaf) for leaf in estimate(evaluation.candidate, evaluation.funnel.policy))

@@ -90,6 +90,12 @@ VERBS = {
         jax=True,
         shown=True,
     ),
+    "tolerance": Verb(
+        "rtcd_jax.cli.run_verbs:tolerance",
+        "find how much of each uncertainty, and of all at once, an elite's funnel bears",
+        jax=True,
+        shown=True,
+    ),
     "export": Verb(
         "rtcd_jax.cli.run_verbs:export",
         "write the controller, its funnel monitor and the design of an elite for a lab",

@@ -135,6 +135,30 @@ def disturb(options: DisturbOptions, console: Console) -> Exit:
     return Exit.OK
 
 
+class ToleranceOptions(Options):
+    """Find the largest factor of every uncertainty, and of all at once, under which an elite's policy has a funnel.
+
+    The box is the run's `uncertainty`, or that of a YAML file. Results: a table, and tolerance/NNN.json, .csv, .png and
+    .pdf in the run folder; all factors are sampled, within 1 %.
+
+    Example: rtcd tolerance checkpoints/pendulum_robust --uncertainty lab.yaml
+    """
+
+    run: Run = Field(description="the run folder")
+    elite: Elite = Field(default=0, description="0 is the best [-] (>= 0); or initial")
+    uncertainty: Annotated[Path | None, shown("FILE", "the run's own")] = Field(
+        default=None, description="a YAML with an `uncertainty` section, whose half widths are the factor 1"
+    )
+    cache: Cache = Field(default=None, description="of compiled programs, '' for none")
+
+
+def tolerance(options: ToleranceOptions, console: Console) -> Exit:
+    from rtcd_jax.analysis.tolerance.study import tolerance_run
+
+    tolerance_run(options.run, options.elite, options.uncertainty, console)
+    return Exit.OK
+
+
 class ExportOptions(Options):
     """Write an elite for a lab: controller and funnel monitor in Python and C, tables, MJCF and URDF.
 

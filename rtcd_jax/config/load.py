@@ -261,6 +261,8 @@ def config_hash(config: Config) -> str:
     stated = resolved(config)
     if config.uncertainty == UncertaintyConfig():
         del stated["uncertainty"]  # as before there was such a section
+    if not config.search.at_least:
+        del stated["search"]["at_least"]
     canonical = json.dumps(stated, sort_keys=True, separators=(",", ":"))
     return hashlib.sha256(canonical.encode()).hexdigest()[:12]
 

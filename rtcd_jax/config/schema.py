@@ -349,6 +349,10 @@ else:
 
 class SearchConfig(Settings):
     objective: Objective = Field(default="sum", description="volume to maximize")
+    at_least: dict[str, Annotated[float, Field(gt=0, le=1e12)]] = Field(
+        default={},
+        description="smallest volumes or push margin, by name, before which the objective counts [their units]",
+    )
     mode: Literal["joint", "nested"] = Field(
         default="joint", description="one search over all, or weights inside designs"
     )
@@ -368,7 +372,13 @@ class SearchConfig(Settings):
         default=NestedConfig(), description="budget of the two loops, used in mode nested alone"
     )
 
+    def __hash__(self) -> int:
+        return hash(self.model_dump_json())  # pydantic's own fails at the mapping
+
     def problems(self) -> Iterator[Problem]:
+        for name in self.at_least:
+            if name not in VOLUMES:
+                yield Problem(("at_least", name), f"must be a volume; {closest(name, tuple(VOLUMES))}")
         if self.mode != "nested":
             return
         designs = self.nested.designs

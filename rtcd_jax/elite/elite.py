@@ -35,7 +35,8 @@ class Elite:
 
     Promised with `confidence`: a state, uniform in its ellipsoid B_k = {x : V_k(x) <= rho_k}, fails with a
     probability of at most `epsilon`. `guarantee` says on what ground; a claimed funnel promises that no state fails.
-    `volumes` are the funnel's, by name, and `record` is all of `NNN.json`.
+    `volumes` are the funnel's, by name, `pushes` the largest impulse on each input at each knot that leaves x* + B J in
+    the funnel (None in files that lack it), and `record` is all of `NNN.json`.
 
     Raises:
         UserError: shapes that do not belong together, or no funnel: a level or an S that is not positive.
@@ -60,6 +61,7 @@ class Elite:
     state_limits: Float[np.ndarray, " n"]
     volumes_per_knot: Float[np.ndarray, " knots"]
     volumes: Mapping[str, float] = field(default_factory=dict)
+    pushes: Float[np.ndarray, "knots m"] | None = None
     record: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self):
@@ -69,6 +71,8 @@ class Elite:
             "rho": (knots,), "Q": (n, n), "R": (m, m), "K_goal": (m, n), "x_goal": (n,), "u_max": (m,),
             "state_limits": (n,), "volumes_per_knot": (knots,),
         }  # fmt: skip
+        if self.pushes is not None:
+            shapes["pushes"] = (knots, m)
         wrong = [f"{name} {getattr(self, name).shape}" for name in shapes if getattr(self, name).shape != shapes[name]]
         if wrong:
             raise UserError(
@@ -108,7 +112,8 @@ class Elite:
         }
         fields: dict[str, Any] = {**named, **numbers, "volumes": volumes, "record": record}
         stored = {"guarantee": "rung"}  # the field's key in NNN.json
-        missing = [stored.get(name, name) for name in cls.__dataclass_fields__ if fields.get(name) is None]
+        needed = [name for name in cls.__dataclass_fields__ if name != "pushes"]
+        missing = [stored.get(name, name) for name in needed if fields.get(name) is None]
         if missing:
             raise UserError(f"the elite lacks {', '.join(missing)}")
         return cls(**fields)

@@ -16,7 +16,7 @@ import json
 import os
 import socket
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, Self, TypeVar, cast, final
@@ -48,6 +48,7 @@ from rtcd_jax.system.files import (
     writing,
 )
 from rtcd_jax.system.provenance import provenance
+from rtcd_jax.volume import LATER
 
 if TYPE_CHECKING:
     from rtcd_jax.system.cluster import Cluster
@@ -359,13 +360,40 @@ def _load(checkpointer: Any, checkpoint: Any, state: State) -> State:
     import jax
     import jax.numpy as jnp
 
-    shapes = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=x.sharding), state)
-    try:
+    def load(state):
+        shapes = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=x.sharding), state)
         loaded = checkpointer.load(checkpoint.step, shapes)
-    except (KeyError, ValueError, OSError, RecursionError) as error:
+        # A loaded array is bound to its devices; a fresh one moves to where the evaluations are.
+        return jax.tree.map(lambda x: jnp.asarray(np.asarray(x.addressable_data(0))), loaded)
+
+    kinds = (KeyError, ValueError, OSError, RecursionError)
+    try:
+        return load(state)
+    except kinds as error:
+        with contextlib.suppress(*kinds):
+            return _with_later_volumes(load(_without_later_volumes(state)))
         raise UserError(
             f"{checkpoint.path} is no state of this search: it is damaged, or another version or precision wrote it; "
             "go on with what provenance.json names, or choose another folder"
         ) from error
-    # A loaded array is bound to its devices; a fresh one moves to where the evaluations are.
-    return jax.tree.map(lambda x: jnp.asarray(np.asarray(x.addressable_data(0))), loaded)
+
+
+def _without_later_volumes(state: State) -> State:
+    """As states were before there was a push margin."""
+    return _volumes_mapped(lambda named: {name: v for name, v in named.items() if name not in LATER}, state)
+
+
+def _with_later_volumes(state: State) -> State:
+    """The inverse, with NaN: the elites are evaluated again at a search's end."""
+    return _volumes_mapped(lambda named: named | dict.fromkeys(LATER, named["sum"] * np.nan), state)
+
+
+def _volumes_mapped(change: Callable[[dict[str, Any]], dict[str, Any]], state: State) -> State:
+    import jax
+
+    from rtcd_jax.types import Volumes
+
+    def mapped(part: Any) -> Any:
+        return Volumes(part.per_knot, change(part.named)) if isinstance(part, Volumes) else part
+
+    return jax.tree.map(mapped, state, is_leaf=lambda part: isinstance(part, Volumes))

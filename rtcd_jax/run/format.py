@@ -9,11 +9,11 @@ import numpy as np
 from rtcd_jax.config.load import config_hash
 from rtcd_jax.evaluation import elite_budget
 from rtcd_jax.numerics.proportion import failure_bound
-from rtcd_jax.policy import options
+from rtcd_jax.policy import input_jumps, options
 from rtcd_jax.problem import Problem
 from rtcd_jax.types import Evaluation, Status
 from rtcd_jax.validation import PhysicsComparison
-from rtcd_jax.volume import VOLUMES
+from rtcd_jax.volume import VOLUMES, largest_pushes
 
 
 def arrays_of(problem: Problem, evaluation: Evaluation) -> dict[str, np.ndarray]:
@@ -35,6 +35,7 @@ def arrays_of(problem: Problem, evaluation: Evaluation) -> dict[str, np.ndarray]
         "x_goal": problem.goal,
         "u_max": problem.input_limits,
         "volumes_per_knot": volumes.per_knot,
+        "pushes": _pushes(problem, evaluation)[0],
         **{f"volumes_{name}": volumes[name] for name in VOLUMES},
         "genome": host.genome,
     }
@@ -79,6 +80,7 @@ def record_of(
             **{name: volumes[name] for name in VOLUMES},
             "share_of_largest_knot": float(volumes.per_knot.max() / max(volumes["sum"], np.finfo(float).tiny)),
         },
+        "push": _push(problem, evaluation),
         "duration": float(funnel.policy.trajectory.dt * problem.intervals),
         "trajectory": {
             "cost": funnel.policy.trajectory.cost,
@@ -91,6 +93,27 @@ def record_of(
         "seed": config.search.seed,
         "config_hash": config_hash(config),
     }
+
+
+def _pushes(problem: Problem, evaluation: Evaluation) -> tuple[np.ndarray, np.ndarray]:
+    """Largest impulses [N+1 m] on every input, knot by knot, that leave x* + B J in the funnel, and in the limits."""
+    funnel = evaluation.funnel
+    jumps = np.asarray(input_jumps(problem, evaluation.candidate, funnel.policy.trajectory))
+    values, xs = np.asarray(funnel.policy.values), np.asarray(funnel.policy.trajectory.xs)
+    inside = largest_pushes(values, np.maximum(np.asarray(funnel.levels), 0), jumps)
+    room = (problem.state_limits - np.abs(xs))[:, :, None]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        within = np.where(jumps != 0, room / np.abs(jumps), np.inf).min(1)
+    return np.where(int(evaluation.status) == Status.OK, inside, 0), within
+
+
+def _push(problem: Problem, evaluation: Evaluation) -> dict[str, Any]:
+    """The push margin [input's unit s], the input and the time [s] of its knot, and what the limits leave there."""
+    inside, within = _pushes(problem, evaluation)
+    k, i = np.unravel_index(np.argmin(inside), inside.shape)
+    time = float(evaluation.funnel.policy.trajectory.dt) * int(k)
+    name = problem.plant.input_names[i]
+    return {"margin": inside[k, i], "input": name, "time": time, "within_limits": within[k, i]}
 
 
 def what_it_bears(problem: Problem) -> str:

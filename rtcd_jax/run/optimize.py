@@ -19,7 +19,7 @@ from rtcd_jax.run.format import arrays_of, record_of, what_it_bears
 from rtcd_jax.run.reevaluation import Reevaluation, Reported, physics_line, row
 from rtcd_jax.run.sharding import Sharded, sharded
 from rtcd_jax.search import search
-from rtcd_jax.search.archive import Elites
+from rtcd_jax.search.archive import Elites, shortfall
 from rtcd_jax.system.cluster import Cluster, Preempted
 from rtcd_jax.system.console import Clock, Console, Progress, times
 from rtcd_jax.system.errors import UserError
@@ -156,10 +156,15 @@ def summary(problem: Problem, initial: Reported, best: Reported) -> Iterator[str
         first, last = before["volumes"][name], after["volumes"][name]
         cells.append(f"{last / first:9.2f}" if first > 0 else f"{'-':>9}")
         yield "".join(cells)
+    if float(shortfall(best.evaluation, problem.config.search)) > 0:
+        wanted = ", ".join(f"{name} {least:g}" for name, least in problem.config.search.at_least.items())
+        yield f"no candidate has what search.at_least demands ({wanted}); the best lacks least of it"
     if before["status"] != Status.OK.name:
         yield f"the initial candidate has no funnel: {Status[before['status']].message}"
     promise = f"probability <= {after['epsilon']:.2g} (confidence {after['confidence']:g})"
     yield f"best: a state uniform in any of its ellipsoids fails to arrive with {promise}"
+    push, unit = after["push"], f"{problem.plant.input_units[0]} s"
+    yield f"best: x*(t) and an impulse of up to {push['margin']:.3g} {unit} at any knot are in its funnel"
     yield f"all funnels bear: {what_it_bears(problem)}"
     design = ", ".join(
         f"{name} {after['design'][name]:.4g} {unit}" for name, unit in problem.plant.design_units.items()

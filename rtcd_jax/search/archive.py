@@ -9,10 +9,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from rtcd_jax.config.schema import SearchConfig
 from rtcd_jax.types import Evaluation, Status, Volumes
 
 FAILED = 1e3
-"""Graded cost of a candidate that bears the uncertainty at all knots but one, more than any -log(volume)."""
+"""Graded cost of a candidate that bears the uncertainty at all knots but one, more than any that has a funnel."""
+TOO_SMALL = 500.0
+"""Cost of a candidate that lacks next to nothing of `search.at_least`, more than any -log(volume)."""
 
 
 class Evaluated(Protocol):
@@ -48,22 +51,33 @@ class Elites(eqx.Module):
         return jnp.sum(jnp.isfinite(self.costs))
 
 
-def cost(evaluation: Evaluated, objective: str) -> Float[Array, "*P"]:
+def cost(evaluation: Evaluated, search: SearchConfig) -> Float[Array, "*P"]:
     """-log(volume), to be minimized, in float64; +inf for a candidate that has failed.
 
-    The logarithm keeps the order, and makes the penalty at the box independent of the volume's unit.
+    The logarithm keeps the order, and makes the penalty at the box independent of the volume's unit. A candidate below
+    what `search.at_least` demands comes after all that are not, and the later the larger the mean of its shortfalls.
     """
-    value = jnp.asarray(evaluation.volumes[objective], jnp.float64)
+    value = jnp.asarray(evaluation.volumes[search.objective], jnp.float64)
     feasible = (evaluation.status == Status.OK) & jnp.isfinite(value) & (value > 0)
-    return jnp.where(feasible, -jnp.log(jnp.where(feasible, value, 1.0)), jnp.inf)
+    costs = jnp.where(feasible, -jnp.log(jnp.where(feasible, value, 1.0)), jnp.inf)
+    if not search.at_least:
+        return costs
+    lacking = shortfall(evaluation, search)
+    return jnp.where(feasible & (lacking > 0), TOO_SMALL * (1 + lacking), costs)
 
 
-def graded_cost(evaluation: Evaluated, objective: str) -> Float[Array, "*P"]:
+def shortfall(evaluation: Evaluated | Evaluation, search: SearchConfig) -> Float[Array, "*P"]:
+    """Mean share that a candidate lacks of what `search.at_least` demands: 0 where it has all, 1 without a funnel."""
+    lacking = [1 - jnp.asarray(evaluation.volumes[name]) / least for name, least in search.at_least.items()]
+    return jnp.mean(jnp.clip(jnp.stack(lacking), 0, 1), axis=0) if lacking else jnp.zeros(evaluation.status.shape)
+
+
+def graded_cost(evaluation: Evaluated, search: SearchConfig) -> Float[Array, "*P"]:
     """`cost`, but finite for a candidate whose funnel does not bear the uncertainty, and less the more of its knots do.
 
     Under a large box nearly all candidates of the first generations fail: a search among equals would learn nothing.
     """
-    costs = cost(evaluation, objective)
+    costs = cost(evaluation, search)
     if evaluation.borne is None:
         return costs
     return jnp.where(evaluation.status == Status.FUNNEL_EMPTY, FAILED * (2 - evaluation.borne), costs)
@@ -82,7 +96,7 @@ def empty(capacity: int, example: Evaluation) -> Elites:
 
 
 def merge(
-    elites: Elites, evaluation: Evaluated, objective: str, generation: Int[Array, "*E"] | int, distance: float
+    elites: Elites, evaluation: Evaluated, search: SearchConfig, generation: Int[Array, "*E"] | int, distance: float
 ) -> Elites:
     """The best E of the elites and a population, failures left out: greedily the best, without its neighbors.
 
@@ -91,7 +105,7 @@ def merge(
     evaluations are neighbors. Works on the host: only the records of those that enter are asked for.
     """
     capacity = elites.costs.shape[0]
-    costs = jnp.concatenate([elites.costs, cost(evaluation, objective)])
+    costs = jnp.concatenate([elites.costs, cost(evaluation, search)])
     genomes = jnp.concatenate([elites.evaluation.genome, jnp.asarray(evaluation.genome)])
     chosen, best = jax.device_get(_choose(costs, genomes, distance, capacity))
     filled, enters = np.isfinite(best), chosen >= capacity

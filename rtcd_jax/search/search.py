@@ -89,10 +89,10 @@ class SearchState(eqx.Module):
 class Generation:
     """One generation's results, on the host; volumes are NaN where a candidate failed.
 
-    `volumes` are [P] each by the objectives' names; `best` and `median` (over the feasible) are those of `objective`
-    in this generation, `best_so_far` that of the archive (all sampled); `feasible` is a share, `counts` and
-    `stops` leave out what did not occur; `sigma` is the (outer) step size [box widths], `evaluations` and `restarts`
-    count from the search's start.
+    `volumes` are [P] each by the objectives' names; `best` (that ranks first) and `median` (over the feasible) are
+    those of `objective` in this generation, `best_so_far` that of the archive (all sampled); `feasible` is a share,
+    `counts` and `stops` leave out what did not occur; `sigma` is the (outer) step size [box widths], `evaluations` and
+    `restarts` count from the search's start.
     """
 
     index: int
@@ -130,14 +130,12 @@ def step(plan: Plan, evaluate: Evaluate, state: SearchState) -> tuple[SearchStat
     draw, directions, anew = jax.random.split(key, 3)
     strategy, points, genomes = _ask(plan, state.strategy, draw)
     evaluation = evaluate(genomes, directions)
-    summary = _Summary.of(evaluation, plan.settings.objective)
-    graded = elites.graded_cost(evaluation, plan.settings.objective)
+    summary = _Summary.of(evaluation, plan.settings)
+    graded = elites.graded_cost(evaluation, plan.settings)
     strategy, stops = _tell(plan, strategy, points, graded, anew)
     after = SearchState(
         strategy=strategy,
-        elites=elites.merge(
-            state.elites, evaluation, plan.settings.objective, int(state.generation), plan.elites.distance
-        ),
+        elites=elites.merge(state.elites, evaluation, plan.settings, int(state.generation), plan.elites.distance),
         generation=state.generation + 1,
         evaluations=state.evaluations + len(summary.costs),
         restarts=state.restarts + jnp.sum(stops != Stop.NONE, dtype=jnp.int32),
@@ -171,7 +169,7 @@ def finish(plan: Plan, state: SearchState, evaluation: Evaluation) -> Elites:
     status = jnp.where(jnp.isfinite(first.costs), evaluation.status, jnp.int32(Status.NOT_FINITE))
     evaluation = eqx.tree_at(lambda e: e.status, evaluation, status)
     none = elites.empty(plan.elites.count, evaluation)
-    return elites.merge(none, evaluation, plan.settings.objective, first.generations, 0.0)
+    return elites.merge(none, evaluation, plan.settings, first.generations, 0.0)
 
 
 class _Loop(Protocol):
@@ -218,9 +216,9 @@ class _Summary(NamedTuple):
     volumes: dict[str, np.ndarray]
 
     @classmethod
-    def of(cls, evaluation: Evaluated, objective: str) -> Self:
+    def of(cls, evaluation: Evaluated, settings: SearchConfig) -> Self:
         volumes = evaluation.volumes.named
-        costs = elites.cost(evaluation, objective)
+        costs = elites.cost(evaluation, settings)
         summary = cls(*jax.device_get((evaluation.genome, evaluation.status, costs, volumes)))
         feasible = np.isfinite(summary.costs)
         return summary._replace(volumes={name: np.where(feasible, v, np.nan) for name, v in summary.volumes.items()})
@@ -230,12 +228,13 @@ def _record(plan: Plan, after: SearchState, summary: _Summary, stops: np.ndarray
     objective = plan.settings.objective
     feasible = np.isfinite(summary.costs)
     volumes = summary.volumes[objective][feasible]
+    ranked_first = summary.costs[feasible] == np.min(summary.costs, initial=np.inf)
     archive = after.elites
     return Generation(
         index=int(after.generation) - 1,
         evaluations=int(after.evaluations),
         objective=objective,
-        best=float(volumes.max()) if volumes.size else float("nan"),
+        best=float(volumes[ranked_first].max()) if volumes.size else float("nan"),
         median=float(np.median(volumes)) if volumes.size else float("nan"),
         best_so_far=float(archive.evaluation.volumes[objective][0]) if int(archive.count) else float("nan"),
         feasible=float(feasible.mean()),

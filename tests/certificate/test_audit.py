@@ -67,12 +67,13 @@ def test_a_table_is_read_bit_by_bit(tmp_path):
 
 
 def test_an_external_funnel_has_every_volume_of_the_list(tmp_path, monkeypatch):
-    monkeypatch.setitem(VOLUMES, "largest", Volume("the largest knot's", lambda v, logs, dt: v.max()))
+    monkeypatch.setitem(VOLUMES, "largest", Volume("the largest knot's", lambda at: at.v.max()))
     external = read(table(tmp_path / "x.csv"))
     arrays, record = elite_of(external, cost(external))
     v = external.volumes
     dt = external.dt
-    expected = [v.sum(), np.trapezoid(v, dx=dt), v[0], np.prod(v) ** (1 / len(v)), v.max()]
+    impulse = swing.PARAMETERS["m"] * swing.PARAMETERS["l"] ** 2 * np.sqrt(external.rho / external.S[:, 1, 1])
+    expected = [v.sum(), np.trapezoid(v, dx=dt), v[0], np.prod(v) ** (1 / len(v)), impulse.min(), v.max()]
     np.testing.assert_allclose([arrays[f"volumes_{name}"] for name in VOLUMES], expected)
     np.testing.assert_allclose([record["volumes"][name] for name in VOLUMES], expected)
 

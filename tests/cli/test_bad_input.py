@@ -17,9 +17,10 @@ SWEEP = str(ROOT / "configs" / "sweep.yaml")
 
 @pytest.fixture
 def run(finished, as_in_a_process, tmp_path, monkeypatch):
-    """A copy of a finished run as `run` in the working folder, with a measured motion."""
+    """A copy of a finished run as `run` in the working folder, with a measured motion and a box of uncertainty."""
     monkeypatch.chdir(tmp_path)
     Path("measured.csv").write_text("time,pos,vel\n0,3,0\n0.1,3.1,0\n")
+    Path("box.yaml").write_text("uncertainty: {input: 0.01}")
     return Path(shutil.copytree(finished, "run"))
 
 
@@ -29,6 +30,7 @@ def command(verb, run="run"):
         "verify": ["--states", "5", "--workers", "1"],
         "replay": ["measured.csv"],
         "disturb": ["--states", "1"],
+        "tolerance": ["--uncertainty", "box.yaml"],
         "export": ["--to", "lab"],
     }
     return [verb, run, *more.get(verb, [])]
@@ -41,7 +43,7 @@ def refused(arguments, capsys):
     return line
 
 
-READERS = ("verify", "report", "animate", "replay", "certify", "disturb", "export")
+READERS = ("verify", "report", "animate", "replay", "certify", "disturb", "tolerance", "export")
 
 
 def cut(name):
@@ -96,7 +98,7 @@ def test_a_damaged_file_of_a_run_is_named(name, verb, run, capsys):
 
 PLACES = {
     "verify": "verification", "report": "figures", "animate": "animation", "replay": "replay",
-    "certify": "certificates", "disturb": "disturbance",
+    "certify": "certificates", "disturb": "disturbance", "tolerance": "tolerance",
 }  # fmt: skip
 
 

@@ -39,7 +39,7 @@ def test_every_key_of_every_configuration_is_there(path):
     def row(key):
         """Numbers by the names of a robot's parameters share a row."""
         parent = key.rpartition(".")[0]
-        return parent if parent in ("uncertainty.design", "uncertainty.plant") else key
+        return parent if parent in ("uncertainty.design", "uncertainty.plant", "search.at_least") else key
 
     assert set(map(row, leaves(resolved(load(path))))) <= rows().keys()
 
@@ -50,7 +50,7 @@ def test_numbers_have_units_and_names_have_their_choices():
         assert named or unit, key
         assert meaning
     told = rows()
-    assert told["search.objective"][2] == r"sum, integral, inlet, geometric\_mean"
+    assert told["search.objective"][2] == r"sum, integral, inlet, geometric\_mean, push"
     assert told["search.population"][:3] == ["-", "128", ">= 4 and <= 1048576"]
     assert told["policy.authority"][:3] == ["-", "1.0", ">= 1e-06 and <= 1"]
     assert "or a variable" in told["policy.authority"][3]

@@ -20,6 +20,7 @@ READERS = {
     "replay": (["inside.csv"], False),
     "certify": (["--workers", "1"], True),
     "disturb": (["--states", "2", "--seed", "3"], None),
+    "tolerance": (["--uncertainty", "box.yaml", "--elite", "initial"], None),
     "export": (["--to", "lab", "--elite", "initial"], None),
 }
 """Verbs on a finished run: the rest of the command line, and whether it draws a live line (None: if it takes long)."""
@@ -43,6 +44,7 @@ def folder(finished, tmp_path_factory):
         lines = (",".join(map(str, row)) for row in [("time", "pos", "vel"), *rows])
         (folder / f"{name}.csv").write_text("\n".join(lines))
     table(folder / "given.csv")
+    (folder / "box.yaml").write_text("uncertainty: {input: 0.01}")
     return folder
 
 
@@ -65,6 +67,10 @@ def test_what_the_options_say_reaches_the_work(sent, folder):
     assert (verified["states"], verified["seed"]) == (20, 3)
     disturbed = json.loads((folder / "run" / "disturbance" / "off_nominal.json").read_text())
     assert disturbed["seed"] == 3
+    tolerated = json.loads((folder / "run" / "tolerance" / "initial.json").read_text())
+    assert [row["name"] for row in tolerated["rows"]] == ["disturbance", "whole box"]
+    assert tolerated["rows"][0]["borne"] == pytest.approx(0.01 * tolerated["rows"][1]["factor"])
+    assert tolerated["rows"][1]["factor"] > 0
     (exported,) = (folder / "lab").glob("export.json")
     assert json.loads(exported.read_text())["elite"] == "initial"
 
@@ -73,6 +79,7 @@ def test_results_reach_the_page_that_is_there(sent):
     """`report` comes before `disturb` and `certify`, and after `verify`."""
     assert "report.html shows this, too" in sent["disturb"][1]
     assert "report.html shows this, too" in sent["certify"][1]
+    assert "report.html shows this, too" in sent["tolerance"][1]
     assert "report.html" not in sent["verify"][1]
 
 

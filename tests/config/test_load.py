@@ -64,7 +64,7 @@ REFUSED = {
     "misspelt section": ({"serch": {}}, "serch = {}: unknown key; did you mean 'search'? Valid: plant, task"),
     "misspelt key": (
         {"search.populaton": 8},
-        "search.populaton = 8: unknown key; did you mean 'population'? Valid: objective, mode, population",
+        "search.populaton = 8: unknown key; did you mean 'population'? Valid: objective, at_least, mode, population",
     ),
     "misspelt plant key": ({"plant.gravty": 1}, "plant.gravty = 1: unknown key; did you mean 'gravity'?"),
     "unlike any key": ({"elites.xyz": 8}, "elites.xyz = 8: unknown key; valid: count, distance, trials, directions"),
@@ -74,8 +74,13 @@ REFUSED = {
     "plant is no mapping": ({"plant": "pendulum"}, "plant = 'pendulum': must be a mapping with a `name`"),
     "misspelt objective": (
         {"search.objective": "inlets"},
-        "search.objective = 'inlets': unknown name; did you mean 'inlet'? Valid: sum, integral, inlet, geometric_mean",
+        "search.objective = 'inlets': unknown name; did you mean 'inlet'? Valid: sum, integral, inlet",
     ),
+    "misspelt demand": (
+        {"search.at_least": {"puhs": 0.1}},
+        "search.at_least.puhs: must be a volume; did you mean 'push'? Valid: sum, integral, inlet",
+    ),
+    "demand of nothing": ({"search.at_least": {"push": 0.0}}, "search.at_least.push = 0.0: must be > 0 and <= 1e+12"),
     "misspelt mode": ({"search.mode": "nest"}, "search.mode = 'nest': unknown name; did you mean 'nested'?"),
     "misspelt rollouts": ({"funnel.rollouts": "mjc"}, "funnel.rollouts = 'mjc': unknown name; did you mean 'mjx'?"),
     "missing section": ({"task": REMOVED}, "task: is missing; from where to where, and within what"),

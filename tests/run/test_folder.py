@@ -21,6 +21,7 @@ from rtcd_jax.run.folder import RunFolder
 from rtcd_jax.search import search
 from rtcd_jax.system import files
 from rtcd_jax.system.errors import UserError
+from rtcd_jax.types import Volumes
 from tests.paths import ROOT
 from tests.search.fake_evaluation import bowl
 from tests.search.search_driver import begin, drive, experiment, plan_of
@@ -184,6 +185,28 @@ def test_a_saved_state_is_restored_bit_by_bit_with_its_types(tmp_path):
     for old, new in zip(jax.tree.leaves(state), jax.tree.leaves(restored), strict=True):
         assert (old.dtype, old.shape) == (new.dtype, new.shape)
         assert np.asarray(old).tobytes() == np.asarray(new).tobytes()
+
+
+def test_a_state_of_an_older_version_that_knew_no_push_margin_goes_on(tmp_path):
+    def older(part):
+        named = {name: volume for name, volume in part.named.items() if name != "push"}
+        return Volumes(part.per_knot, named)
+
+    is_volumes = lambda part: isinstance(part, Volumes)  # noqa: E731
+    config = experiment()
+    plan = plan_of(config)
+    (state, _), *_ = search.run(plan, bowl, begin(plan))
+    with RunFolder.open(tmp_path / "run", config) as folder:
+        folder.append({"index": 0})
+        folder.save(jax.tree.map(lambda part: older(part) if is_volumes(part) else part, state, is_leaf=is_volumes), 1)
+    with RunFolder.open(tmp_path / "run", config) as folder:
+        restored = folder.restore(begin(plan))
+    assert jax.tree.structure(restored) == jax.tree.structure(state)
+    assert np.all(np.isnan(restored.elites.evaluation.volumes["push"]))
+    for name in ("sum", "inlet"):
+        old, new = (each.elites.evaluation.volumes[name] for each in (state, restored))
+        np.testing.assert_array_equal(old, new)
+    np.testing.assert_array_equal(state.elites.costs, restored.elites.costs)
 
 
 def test_only_the_latest_states_are_kept_and_saving_one_twice_is_harmless(tmp_path):
@@ -514,6 +537,7 @@ import resource, signal, sys
 from pathlib import Path
 import jax.numpy as jnp
 from rtcd_jax.system.errors import UserError
+from rtcd_jax.types import Volumes
 from rtcd_jax.run.folder import RunFolder
 from tests.search.search_driver import experiment
 

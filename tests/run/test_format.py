@@ -99,7 +99,7 @@ def test_the_arrays_have_the_documented_names_and_shapes(arrays):
         "time": (KNOTS,), "x": (KNOTS, n), "u": (KNOTS - 1, m), "K": (KNOTS, m, n), "S": (KNOTS, n, n),
         "rho": (KNOTS,), "trials": (KNOTS,), "Q": (n, n), "R": (m, m), "K_goal": (m, n), "x_goal": (n,), "u_max": (m,),
         "volumes_sum": (), "volumes_integral": (), "volumes_inlet": (), "volumes_geometric_mean": (),
-        "volumes_per_knot": (KNOTS,), "genome": (5,),
+        "volumes_push": (), "volumes_per_knot": (KNOTS,), "pushes": (KNOTS, m), "genome": (5,),
     }  # fmt: skip
     assert {name: array.shape for name, array in arrays.items()} == shapes
 
@@ -113,6 +113,9 @@ def test_the_arrays_fit_together(arrays):
     np.testing.assert_array_equal(arrays["K_goal"], arrays["K"][-1])
     np.testing.assert_allclose(arrays["volumes_per_knot"], np.pi * arrays["rho"] / np.sqrt(np.linalg.det(arrays["S"])))
     np.testing.assert_allclose(arrays["volumes_sum"], arrays["volumes_per_knot"].sum())
+    impulses = mass * length**2 * np.sqrt(arrays["rho"] / arrays["S"][:, 1, 1])
+    np.testing.assert_allclose(arrays["pushes"][:, 0], impulses)
+    np.testing.assert_allclose(arrays["volumes_push"], impulses.min())
     np.testing.assert_allclose(np.diff(arrays["time"]), arrays["time"][1], rtol=1e-9)
     assert arrays["time"][0] == 0
     np.testing.assert_allclose(arrays["x"][[0, -1]], [[0, 0], arrays["x_goal"]], atol=1e-9)
@@ -188,4 +191,4 @@ def test_the_summary_has_a_dash_where_a_number_is_none():
     lines = list(summary(pipeline.problem(), initial, first))
     total = float(best.volumes["sum"])
     assert lines[1].split() == ["sum", "0", "-", f"{total:.5g}", "0.0%", "-"]
-    assert "the initial candidate has no funnel" in lines[5]
+    assert "the initial candidate has no funnel" in lines[6]

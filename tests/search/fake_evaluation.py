@@ -17,7 +17,13 @@ def evaluate_one(genome, volume, status):
     trajectory = Trajectory(mark * jnp.ones((N, 1)), xs, mark, mark, mark, jnp.int32(7), status)
     policy = Policy(trajectory, mark * jnp.ones((N + 1, 1, 2)), values, status)
     funnel = Funnel(policy, mark * jnp.ones(N + 1), jnp.full(N + 1, 9), status)
-    named = {"sum": volume, "integral": 2 * volume, "inlet": 1 / volume, "geometric_mean": volume**2}
+    named = {
+        "sum": volume,
+        "integral": 2 * volume,
+        "inlet": 1 / volume,
+        "geometric_mean": volume**2,
+        "push": volume / 100,
+    }
     volumes = Volumes(volume * jnp.ones(N + 1), named)
     candidate = Candidate(PendulumDesign(genome[0], genome[-1]), mark * jnp.ones(2), mark * jnp.ones(1))
     return Evaluation(genome, candidate, funnel, volumes, status)

@@ -3,11 +3,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from rtcd_jax.config.schema import SearchConfig
 from rtcd_jax.search import archive as elites
 from rtcd_jax.types import Status
 from tests.search.fake_evaluation import population
 
 CAPACITY, DISTANCE = 5, 0.05
+BY_SUM = SearchConfig()
 
 
 def random_population(seed, size=40, dimensions=2):
@@ -23,7 +25,7 @@ def nothing(capacity=CAPACITY, dimensions=2):
 def merged(populations, capacity=CAPACITY, distance=DISTANCE, objective="sum"):
     archive = nothing(capacity, populations[0].genome.shape[1])
     for generation, evaluation in enumerate(populations):
-        archive = elites.merge(archive, evaluation, objective, generation, distance)
+        archive = elites.merge(archive, evaluation, SearchConfig(objective=objective), generation, distance)
     return archive
 
 
@@ -51,7 +53,7 @@ def test_sorted_apart_feasible_and_with_the_best_ever_seen(seed):
 def test_whatever_is_left_out_is_worse_than_the_last_or_next_to_a_better_one():
     evaluation = random_population(3, size=200)
     archive = merged([evaluation])
-    costs = np.asarray(elites.cost(evaluation, "sum"))
+    costs = np.asarray(elites.cost(evaluation, BY_SUM))
     kept = np.asarray(archive.evaluation.genome)
     left_out = [k for k in range(200) if np.isfinite(costs[k]) and not np.any(np.all(evaluation.genome[k] == kept, 1))]
     assert left_out
@@ -84,8 +86,8 @@ def test_without_neighbors_the_order_of_merges_does_not_matter():
 
 def test_merging_twice_changes_nothing():
     evaluation = random_population(1)
-    once = elites.merge(nothing(), evaluation, "sum", 4, DISTANCE)
-    assert same(once, elites.merge(once, evaluation, "sum", 9, DISTANCE))
+    once = elites.merge(nothing(), evaluation, BY_SUM, 4, DISTANCE)
+    assert same(once, elites.merge(once, evaluation, BY_SUM, 9, DISTANCE))
     assert np.all(once.generations == 4)
 
 
@@ -130,17 +132,30 @@ def test_empty_slots_are_recognizable_and_survive_a_merge_of_failures():
 
 
 @pytest.mark.parametrize(
-    ("objective", "value"), [("sum", 3.0), ("integral", 6.0), ("inlet", 1 / 3), ("geometric_mean", 9.0)]
+    ("objective", "value"), [("sum", 3.0), ("integral", 6.0), ("inlet", 1 / 3), ("geometric_mean", 9.0), ("push", 0.03)]
 )
 def test_the_cost_is_the_negative_logarithm_of_the_named_volume(objective, value):
     evaluation = population([[0.1, 0.2]], [3.0])
-    np.testing.assert_allclose(elites.cost(evaluation, objective), [-np.log(value)], rtol=1e-15)
+    np.testing.assert_allclose(elites.cost(evaluation, SearchConfig(objective=objective)), [-np.log(value)], rtol=1e-15)
 
 
 def test_the_objective_decides_the_order():
     evaluation = population([[0.1, 0.1], [0.9, 0.9]], [1.0, 2.0])
     by_sum, by_inlet = (merged([evaluation], objective=o).evaluation.volumes["sum"] for o in ("sum", "inlet"))
     assert (by_sum[0], by_inlet[0]) == (2.0, 1.0)
+
+
+def test_what_lacks_a_demanded_volume_ranks_behind_what_has_it_by_how_much_it_lacks():
+    """Whatever the objective says of them: 8 and 2 lack push, 8 less of it; 20 and 40 do not, and 40 is the larger."""
+    evaluation = population(np.linspace(0, 1, 5)[:, None] * np.ones(2), [8.0, 40.0, 2.0, 20.0, 90.0], [0, 0, 0, 0, 3])
+    demanding = SearchConfig(objective="inlet", at_least={"push": 0.1, "sum": 1.0})
+    archive = elites.merge(nothing(), evaluation, demanding, 0, DISTANCE)
+    assert archive.evaluation.volumes["sum"][:4].tolist() == [20.0, 40.0, 8.0, 2.0]
+    assert int(archive.count) == 4
+    np.testing.assert_allclose(elites.shortfall(evaluation, demanding), [0.1, 0, 0.4, 0, 0], atol=1e-12)
+    graded = np.asarray(elites.graded_cost(evaluation, demanding))
+    assert np.max(graded[:4]) < elites.FAILED
+    assert np.isinf(graded[4])
 
 
 def test_shapes_and_dtypes_stay():
@@ -160,22 +175,24 @@ def test_records_are_asked_for_only_where_one_enters():
 
     better, worse = population([[0.5, 0.5]], [2.0]), population([[0.5, 0.51]], [1.0])
     archive = merged([better])
-    assert same(elites.merge(archive, Asked(worse), "sum", 1, DISTANCE), archive)
+    assert same(elites.merge(archive, Asked(worse), BY_SUM, 1, DISTANCE), archive)
     with pytest.raises(LookupError):
-        elites.merge(merged([worse]), Asked(better), "sum", 1, DISTANCE)
+        elites.merge(merged([worse]), Asked(better), BY_SUM, 1, DISTANCE)
 
 
 def test_single_precision_evaluations_are_kept_as_they_are():
     evaluation = jax.tree.map(
         lambda leaf: leaf.astype(jnp.float32) if leaf.dtype == jnp.float64 else leaf, random_population(2)
     )
-    archive = elites.merge(elites.empty(CAPACITY, evaluation), evaluation, "sum", 0, DISTANCE)
+    archive = elites.merge(elites.empty(CAPACITY, evaluation), evaluation, BY_SUM, 0, DISTANCE)
     assert archive.evaluation.genome.dtype == jnp.float32
     assert archive.costs.dtype == jnp.float64
 
 
 def test_errors_name_the_value_and_what_would_have_been_right():
-    with pytest.raises(KeyError, match="no volume is called 'hull'; there are sum, integral, inlet, geometric_mean"):
-        elites.cost(random_population(0), "hull")
+    with pytest.raises(
+        KeyError, match="no volume is called 'hull'; there are sum, integral, inlet, geometric_mean, push"
+    ):
+        elites.cost(random_population(0), SearchConfig.model_construct(objective="hull"))
     with pytest.raises(ValueError, match="at least 1 elite, got 0"):
         elites.empty(0, random_population(0))

@@ -2,6 +2,7 @@
 
 off_nominal   success shares from uniform states of the first ellipsoids (the paper's simulation test)
 impulse       a push during the motion, over its time and size (the paper's hardware test)
+push_margin   the largest sudden push that the funnel contains at each time, beside the largest one recovered from
 robustness    model errors, noise, delay, slow motors, low control rates, perturbations, and a score
 """
 
@@ -10,7 +11,17 @@ from pathlib import Path
 from typing import Any
 
 from rtcd_jax.analysis.disturb.comparison import Comparison, Meter, motions, read_comparison, run
-from rtcd_jax.analysis.disturb.experiments import FACTORS, SIZES, TIMES, impulse, off_nominal, perturbations, robustness
+from rtcd_jax.analysis.disturb.experiments import (
+    FACTORS,
+    KICKS,
+    SIZES,
+    TIMES,
+    impulse,
+    off_nominal,
+    perturbations,
+    push_margin,
+    robustness,
+)
 from rtcd_jax.analysis.disturb.figures import draw_disturbance
 from rtcd_jax.analysis.disturb.scenarios import Outcome, Rollouts
 from rtcd_jax.system.console import Console
@@ -19,7 +30,7 @@ from rtcd_jax.system.files import make_folder, replace_json
 
 
 def disturb_run(folder: Path, states: int, seed: int, console: Console) -> None:
-    """Runs all experiments; stores `disturbance/{off_nominal,impulse,robustness}.json` and their figures.
+    """Runs all experiments; stores `disturbance/{off_nominal,impulse,push_margin,robustness}.json` and their figures.
 
     Raises:
         UserError: no run folder, a run without elites, a folder that cannot be read or written, or other devices than
@@ -37,6 +48,7 @@ def disturb_run(folder: Path, states: int, seed: int, console: Console) -> None:
     records = {
         "off_nominal": off_nominal(comparison, states, seed, simulate),
         "impulse": impulse(comparison, simulate),
+        "push_margin": push_margin(comparison, simulate),
         "robustness": robustness(comparison, seed, simulate),
     }
     of_run = {"config_hash": comparison.config_hash, "plant": comparison.elites[0].plant}
@@ -51,19 +63,27 @@ def disturb_run(folder: Path, states: int, seed: int, console: Console) -> None:
 def _all_motions(comparison: Comparison, states: int) -> int:
     loops = len(comparison.names)
     robust = sum(len(perturbation.levels) * perturbation.repeats for perturbation in perturbations(comparison))
-    return sum(map(motions, (len(FACTORS) * loops**2 * states, loops * TIMES * SIZES, loops * robust)))
+    pushes = loops * TIMES * SIZES, loops * TIMES * KICKS * 2
+    return sum(map(motions, (len(FACTORS) * loops**2 * states, *pushes, loops * robust)))
 
 
 def _summary(comparison: Comparison, records: Mapping[str, Mapping[str, Any]]) -> Iterator[str]:
-    off, push, robust = (records[name]["summary"] for name in ("off_nominal", "impulse", "robustness"))
+    off, push, sudden, robust = (
+        records[name]["summary"] for name in ("off_nominal", "impulse", "push_margin", "robustness")
+    )
     heading = "".join(f"{name:>12}" for name in comparison.names)
     yield f"{'arrived from (sampled)':30}{heading}"
     for place, shares in off.items():
         yield f"  {place:28}" + "".join(f"{shares[name]:12.1%}" for name in comparison.names)
     yield f"{'pushes':30}{heading}"
     yield f"{'  recovered':30}" + "".join(f"{push[name]['recovered']:12.1%}" for name in comparison.names)
-    largest = "".join(f"{push[name]['largest_at_all_times']:12.3g}" for name in comparison.names)
-    yield f"{f'  all tolerated up to [{comparison.plant.input_units[0]} s]':30}{largest}"
+    unit = f"[{comparison.plant.input_units[0]} s]"
+    for what, told, key in (
+        ("all tolerated up to", push, "largest_at_all_times"),
+        ("sudden ones up to", sudden, "tolerated_at_all_times"),
+        ("inside the funnel", sudden, "push_margin"),
+    ):
+        yield f"{f'  {what} {unit}':30}" + "".join(f"{told[name][key]:12.3g}" for name in comparison.names)
     yield f"{'robustness':30}{heading}"
     for criterion in robust[comparison.names[0]]:
         shares = "".join(f"{robust[name][criterion]:12.1%}" for name in comparison.names)

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any, final
 
@@ -24,6 +25,7 @@ from rtcd_jax.analysis.disturb.scenarios import (
 from rtcd_jax.elite.closed_loop import ARRIVED, FORGOTTEN, ClosedLoop, settling_time
 from rtcd_jax.elite.elite import Elite, initial_and_best
 from rtcd_jax.elite.simulators import dynamics_of
+from rtcd_jax.export.rate import control_rate
 from rtcd_jax.plants import plant_class
 from rtcd_jax.plants.base import Plant
 from rtcd_jax.system.console import Clock, Console, Progress, times
@@ -51,6 +53,12 @@ class Comparison:
     loops: Loops
     horizon: float
     config_hash: str | None
+
+    @cached_property
+    def export_periods(self) -> np.ndarray:
+        """Control periods [C] that exports of these loops state [s]; the integrator's step where none suffices."""
+        periods = [control_rate(elite, None).period for elite in self.elites]
+        return np.array([STEP if period is None else period for period in periods])
 
     @property
     def indices(self) -> dict[str, int]:

@@ -2,7 +2,7 @@
 
 Every experiment gives a record for its JSON file, with a `summary` in it. What counts as recovered:
 
-    off-nominal, impulse   stays inside the limits and ends with V <= 0.001 rho_N, as `rtcd verify` asks for
+    off-nominal, pushes    stays inside the limits and ends with V <= 0.001 rho_N, as `rtcd verify` asks for
     robustness             stays inside the limits and in the last second inside the goal's region, V <= rho_N:
                            noise that never ends lets nothing settle
 """
@@ -18,10 +18,21 @@ import jax.numpy as jnp
 import numpy as np
 
 from rtcd_jax.analysis.disturb.comparison import Comparison, by_loop
-from rtcd_jax.analysis.disturb.scenarios import LONGEST_DELAY, PULSES, STEP, Outcome, Rollouts, undisturbed
+from rtcd_jax.analysis.disturb.scenarios import (
+    LONGEST_DELAY,
+    PULSES,
+    STEP,
+    Outcome,
+    Rollouts,
+    motor_speeds,
+    undisturbed,
+)
 from rtcd_jax.elite.closed_loop import ARRIVED
 from rtcd_jax.elite.elite import Elite
+from rtcd_jax.elite.funnel import linearized
+from rtcd_jax.elite.simulators import dynamics_of
 from rtcd_jax.numerics.proportion import clopper_pearson
+from rtcd_jax.volume import largest_pushes
 
 CONFIDENCE = 0.95
 """Of the two-sided intervals of the shares."""
@@ -35,6 +46,9 @@ PUSH_WIDTH = 0.02
 """Standard deviation of a push's bell [s]."""
 LARGEST_PUSH = 0.3
 """Impulse of the largest push over the input limit [s]."""
+
+KICKS = 24
+"""Sizes of a sudden push at each time."""
 
 LEVELS = 21
 """Of every perturbation, from none to the largest (RealAIGym: N_var)."""
@@ -56,6 +70,12 @@ PULSE_WIDTHS = 0.05, 0.1
 """Standard deviation of a pulse's bell [s] (RealAIGym's)."""
 PULSE_HEIGHTS = 0.08, 0.83
 """Of a pulse, over the input limit (RealAIGym: 0.5 to 5 of 6 N m)."""
+FRICTION = 0.25
+"""Largest dry friction on a motor's axis over its limit."""
+SLIPS = 0.01
+"""Speed below which dry friction falls to zero, over the motor's largest nominal one."""
+HOLDS = 1, 2, 4, 8, 16
+"""Control periods over that of an export."""
 RATES = 1000, 500, 250, 200, 125, 100, 50
 """Of the controller [Hz]."""
 SCORED = "model", "velocity noise", "torque noise", "response", "delay", "perturbation"
@@ -143,6 +163,54 @@ def impulse(comparison: Comparison, simulate: Simulate) -> dict[str, Any]:
     }
 
 
+def push_margin(comparison: Comparison, simulate: Simulate) -> dict[str, Any]:
+    """The largest impulse on the first input that leaves x* + B J in the funnel, and the largest one recovered from.
+
+    At `TIMES` knots, by pushes of one step to both sides, on a ladder of `KICKS` impulses that begins with the funnel's
+    own: what is tolerated there is 0 where that one is lost, and the funnel's claim refuted.
+    """
+    elites = comparison.elites
+    knots = np.stack([np.linspace(0, len(elite.u), TIMES).round().astype(int) for elite in elites])
+    times = np.stack([elite.time[k] for elite, k in zip(elites, knots, strict=True)])
+    inside = [_pushes_inside(elite) for elite in elites]
+    claimed = np.stack([pushes[k] for pushes, k in zip(inside, knots, strict=True)])
+    most = np.maximum(LARGEST_PUSH * elites[0].u_max[0], 4 * claimed)
+    rungs = np.geomspace(claimed, most, KICKS, axis=-1)
+    loop, when, size, side = (axis.ravel() for axis in np.indices((len(elites), TIMES, KICKS, 2)))
+    rollouts = from_start(comparison, loop)
+    steps = np.round(times / STEP)[loop, when]
+    heights = np.zeros(rollouts.heights.shape)
+    heights[0, 0] = rungs[loop, when, size] * np.where(side, -1, 1) / STEP
+    rollouts = dataclasses.replace(
+        rollouts,
+        centers=rollouts.centers.at[0].set((steps + 0.5) * STEP),
+        widths=rollouts.widths.at[0].set(STEP / 8),  # the steps before and after get less than 1e-13 of it
+        heights=jnp.asarray(heights),
+    )
+    recovered = _arrived(simulate(rollouts, "push margin", True)).reshape(*rungs.shape, 2).all(axis=-1)
+    borne = np.cumprod(recovered, axis=-1).sum(axis=-1)
+    ladder = np.concatenate([np.zeros((*borne.shape, 1)), rungs], axis=-1)
+    tolerated = np.take_along_axis(ladder, borne[..., None], axis=-1)[..., 0]
+    return {
+        "experiment": f"a push of {STEP:g} s on the first input, on the nominal motion at a knot",
+        "impulse_unit": f"{comparison.plant.input_units[0]} s",
+        "times": dict(by_loop(comparison, times)),
+        "inside_funnel": dict(by_loop(comparison, claimed)),
+        "tolerated": dict(by_loop(comparison, tolerated)),
+        "summary": {
+            name: {"push_margin": pushes.min(), "tolerated_at_all_times": limit.min()}
+            for (name, limit), pushes in zip(by_loop(comparison, tolerated), inside, strict=True)
+        },
+    }
+
+
+def _pushes_inside(elite: Elite) -> np.ndarray:
+    """Of every knot, by the first input."""
+    held = np.concatenate([elite.u, np.zeros_like(elite.u[:1])])
+    _, jumps = linearized(dynamics_of(elite), elite.x, held)
+    return largest_pushes(elite.S, elite.rho, jumps)[:, 0]
+
+
 class Perturbation(NamedTuple):
     """One way in which the robot is not as the model says: `apply(rollouts, level [L], random) -> rollouts`.
 
@@ -207,6 +275,7 @@ def _scores(tested: list[Perturbation], successes: list[np.ndarray], loops: int)
 
 def perturbations(comparison: Comparison) -> list[Perturbation]:
     """All of them, for the robot of a comparison."""
+    unit = comparison.plant.input_units[0]
     elite = comparison.elites[0]
     half = elite.x_goal.size // 2
     limits = elite.u_max
@@ -229,6 +298,14 @@ def perturbations(comparison: Comparison) -> list[Perturbation]:
                 lambda rollouts, level, _: dataclasses.replace(rollouts, delay=_steps(level))),
         Perturbation("perturbation", "perturbation", "profile", np.arange(PROFILES, dtype=float), 1,
                 lambda rollouts, level, random: pulsed(comparison, rollouts, random)),
+        Perturbation("friction", "dry friction", unit, FRICTION * limits[0] * np.linspace(0, 1, LEVELS), 1,
+                lambda rollouts, level, _: dataclasses.replace(
+                    rollouts,
+                    friction=limits[:, None] / limits[0] * level,
+                    slips=SLIPS * _motor_speeds(comparison)[:, None] * jnp.ones_like(rollouts.friction))),
+        Perturbation("hold", "hold", "times the export's period", np.array(HOLDS, float), 1,
+                lambda rollouts, level, _: dataclasses.replace(
+                    rollouts, period=_steps(level * comparison.export_periods[np.asarray(rollouts.loop)]))),
         Perturbation("control rate", "control rate", "Hz", np.array(RATES, float), 1,
                 lambda rollouts, rate, _: dataclasses.replace(rollouts, period=_steps(1 / rate))),
     ]  # fmt: skip
@@ -256,9 +333,19 @@ def _parameters(comparison: Comparison) -> Mapping[str, Callable[[Rollouts, np.n
     }
 
 
+def _motor_speeds(comparison: Comparison) -> np.ndarray:
+    """The largest nominal speed of each motor [m], over all loops."""
+    largest = []
+    for index, elite in enumerate(comparison.elites):
+        plant, design = jax.tree.map(lambda leaf, index=index: leaf[index], (comparison.plant, comparison.design))
+        largest.append(np.abs(motor_speeds(plant, design, jnp.asarray(elite.x.T))).max(axis=1))
+    return np.max(largest, axis=0)
+
+
 def _steps(seconds: np.ndarray) -> jax.Array:
-    """The nearest whole steps."""
-    return jnp.asarray(np.round(seconds / STEP), int)
+    """The nearest whole steps, one at least but for what is zero."""
+    steps = np.round(seconds / STEP)
+    return jnp.asarray(np.where(seconds > 0, np.maximum(steps, 1), 0), int)
 
 
 def pulsed(comparison: Comparison, rollouts: Rollouts, random: np.random.Generator) -> Rollouts:

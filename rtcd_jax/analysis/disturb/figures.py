@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from rtcd_jax.analysis.report.canvas import GRAY, LIGHT, SMALL, WIDTH, blank, written
+from rtcd_jax.analysis.report.canvas import GRAY, LIGHT, SMALL, WIDTH, blank, logarithmic, written
 from rtcd_jax.analysis.report.words import words
 from rtcd_jax.system.files import read_json
 
@@ -34,6 +34,7 @@ def draw_disturbance(folder: Path) -> list[Path]:
     for name, draw, size in (
         ("off_nominal", _off_nominal, (WIDTH, 3.0)),
         ("impulse", _impulse, (WIDTH, 3.2)),
+        ("push_margin", _push_margin, (WIDTH, 2.6)),
         ("robustness", _robustness, None),
     ):
         record = read_json(place / f"{name}.json", "make it by `rtcd disturb`")
@@ -83,13 +84,32 @@ def _impulse(figure: "Figure", record: Mapping[str, Any]) -> None:
     figure.legend(handles=handles, loc="outside upper center", ncols=2)
 
 
+def _push_margin(figure: "Figure", record: Mapping[str, Any]) -> None:
+    axes = figure.subplots()
+    for name, times in record["times"].items():
+        tolerated = np.array(record["tolerated"][name])
+        axes.plot(times, record["inside_funnel"][name], color=COLORS[name], label=f"{name}: inside the funnel")
+        axes.plot(
+            times, np.where(tolerated > 0, tolerated, np.nan), ".", color=COLORS[name], label=f"{name}: recovered from"
+        )
+    logarithmic(axes)
+    axes.set_xlabel("time of the push [s]")
+    axes.set_ylabel(f"sudden push\n[{record['impulse_unit']}]")
+    figure.legend(*axes.get_legend_handles_labels(), loc="outside upper center", ncols=2)
+
+
 def _robustness(figure: "Figure", record: Mapping[str, Any]) -> None:
-    perturbations = record["troubles"]
+    perturbations = sorted(record["troubles"], key=_success_of_the_best)
     panels = figure.subplots(len(perturbations), 1, squeeze=False)[:, 0]
     for axes, perturbation in zip(panels, perturbations, strict=True):
         _strip(axes, perturbation)
     scores = ", ".join(f"{name} {criteria['score']:.0%}" for name, criteria in record["summary"].items())
-    figure.suptitle(f"share of successes at each level (dark: all); score {scores}", fontsize=9)
+    figure.suptitle(f"share of successes at each level (dark: all), what fails first above; score {scores}", fontsize=9)
+
+
+def _success_of_the_best(perturbation: Mapping[str, Any]) -> float:
+    """By which what fails first comes first."""
+    return float(np.mean(list(perturbation["success"].values())[-1]))
 
 
 def _strip(axes: "Axes", perturbation: Mapping[str, Any]) -> None:

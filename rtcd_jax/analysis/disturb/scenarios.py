@@ -2,7 +2,8 @@
 
 The robot is the plant's closed form with the rollout's true parameters, by Runge-Kutta steps of `STEP`, its input held
 in each. The controller knows nothing of what is wrong: at its own rate it evaluates the loop's law, from the state of a
-while ago and with noise on the velocities; what it asks for lags, is noisy, and ends at the robot's true limits.
+while ago and with noise on the velocities; what it asks for lags, is noisy, and ends at the robot's true limits. Dry
+friction on the motors' axes opposes their speeds, and is held in a step.
 """
 
 import math
@@ -93,9 +94,10 @@ class Rollouts(eqx.Module):
     """L motions and what perturbs them; leaves [L], with the states' or inputs' axis before it.
 
     `loop` is the controller's index and `x` the state at t = 0. Of the robot: `plant` and `design` with its true
-    numbers, and `actuator_scale`, its true input limit over the nominal one. Of the controller: control period and
-    delay [steps], noise on the velocities (standard deviation [n/2]). Of the motor: `lag`, the time constant [s], noise
-    (standard deviation [m]). Pulses on the inputs: center [s], width (standard deviation [s]) and height.
+    numbers, `actuator_scale`, its true input limit over the nominal one, and Coulomb `friction` on the motors' axes [m]
+    with the speeds `slips` [m] below which it falls to zero. Of the controller: control period and delay [steps], noise
+    on the velocities (standard deviation [n/2]). Of the motor: `lag`, the time constant [s], noise (standard deviation
+    [m]). Pulses on the inputs: center [s], width (standard deviation [s]) and height.
     """
 
     loop: Int[Array, " L"]
@@ -103,6 +105,8 @@ class Rollouts(eqx.Module):
     plant: Plant
     design: Any
     actuator_scale: Float[Array, " L"]
+    friction: Float[Array, "m L"]
+    slips: Float[Array, "m L"]
     period: Int[Array, " L"]
     delay: Int[Array, " L"]
     velocity_noise: Float[Array, "n/2 L"]
@@ -147,6 +151,8 @@ def undisturbed(plant: Plant, design: Any, loop: np.ndarray, x: np.ndarray) -> R
         plant=own[0],
         design=own[1],
         actuator_scale=jnp.ones(count),
+        friction=zeros(m),
+        slips=jnp.ones((m, count)),
         period=jnp.ones(count, int),
         delay=jnp.zeros(count, int),
         velocity_noise=zeros(n // 2),
@@ -170,6 +176,7 @@ def start(loops: Loops, rollouts: Rollouts) -> Motion:
 def advance(loops: Loops, rollouts: Rollouts, motion: Motion, first: Int[Array, ""], key: jax.Array) -> Motion:
     """The rollouts after `CHUNK` more steps, from step `first` on; one that left the limits stays where it did."""
     noisy = jnp.any(rollouts.velocity_noise > 0) | jnp.any(rollouts.input_noise > 0)
+    rubs, free = jnp.any(rollouts.friction > 0), jnp.zeros_like(rollouts.friction)
     follow = jnp.where(rollouts.lag > 0, -jnp.expm1(-STEP / jnp.maximum(rollouts.lag, STEP * 1e-3)), 1.0)
 
     def slope(x: tuple, u):
@@ -182,7 +189,8 @@ def advance(loops: Loops, rollouts: Rollouts, motion: Motion, first: Int[Array, 
         given = motion.input + follow * (command - motion.input)
         bound = rollouts.actuator_scale * loops.input_limits[:, None]
         pushed = jnp.clip(given + noise, -bound, bound) + _pushes(rollouts, t + STEP / 2)
-        x = rk4_step(slope, split(motion.x), pushed, STEP)
+        rubbing = jax.lax.cond(rubs, lambda: _friction(rollouts, motion.x), lambda: free)
+        x = rk4_step(slope, split(motion.x), pushed - rubbing, STEP)
         moved = jnp.where(motion.left, motion.x, jnp.stack(x))
         return Motion(moved, given, command, noise, past, motion.left | ~loops.inside(moved)), None
 
@@ -203,6 +211,20 @@ def _decide(loops: Loops, rollouts: Rollouts, motion: Motion, past, index, key, 
     due = index % rollouts.period == 0
     asked = jnp.stack(loops.law(rollouts.loop, index * STEP, split(measured)))
     return jnp.where(due, asked, motion.command), jnp.where(due, rollouts.input_noise * random[half:], motion.noise)
+
+
+def motor_speeds(plant: Plant, design: Any, x: Float[Array, "n L"]) -> Float[Array, "m L"]:
+    """v_i = dE/dx . B_i, by which an input u_i has the power u_i v_i."""
+    slope = jax.grad(lambda x: jnp.sum(plant.energy(design, x)))(x)
+    inputs = jnp.eye(plant.m)[:, :, None] * jnp.ones_like(x[0])
+    coasting = plant.dynamics(design, x, jnp.zeros_like(inputs[0]))
+    return jnp.stack([jnp.sum(slope * (plant.dynamics(design, x, u) - coasting), axis=0) for u in inputs])
+
+
+def _friction(rollouts: Rollouts, x: Float[Array, "n L"]) -> Float[Array, "m L"]:
+    """Coulomb's, smoothed below the speeds `slips`."""
+    speeds = motor_speeds(rollouts.plant, rollouts.design, x)
+    return rollouts.friction * speeds / jnp.sqrt(speeds**2 + rollouts.slips**2)
 
 
 def _pushes(rollouts: Rollouts, t) -> Float[Array, "m L"]:

@@ -1,8 +1,10 @@
 """What a figure shows, in print and on the page alike: panels of curves, bands and shares over one horizontal axis.
 
-canvas.py prints a chart by matplotlib, traces.py hands it to plotly.js.
+canvas.py prints a chart by matplotlib, traces.py hands it to plotly.js, `table` writes its numbers.
 """
 
+import csv
+import io
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal, final
@@ -85,6 +87,20 @@ class Chart:
     columns: int = 1
     events: Sequence[float] = ()
     event: str = ""
+
+
+def table(chart: Chart) -> str:
+    """The chart's curves as CSV, one point a line: panel, curve, and both coordinates."""
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(["panel", "curve", chart.x, "value"])
+    for panel in chart.panels:
+        label = (panel.label or panel.title).replace("\n", " ")
+        for mark in panel.marks:
+            if isinstance(mark, Curve):
+                points = zip(mark.x.tolist(), mark.y.tolist(), strict=True)
+                writer.writerows([label, mark.label, repr(x), repr(y)] for x, y in points)
+    return text.getvalue()
 
 
 def more_than_a_decade(*values: Float[np.ndarray, " T"]) -> bool:

@@ -43,7 +43,15 @@ def levels(config: Config, funnels: Sequence[FunnelView], note: str = "") -> Cha
     """rho and the volume of every knot over time."""
     rho = [Curve(funnel.elite.time, funnel.elite.rho, funnel.label, funnel.color, style="marked") for funnel in funnels]
     panels = [Panel("level ρ of V [-]", rho, logarithmic=True), volumes(config, funnels)]
-    return Chart("Levels and volumes", "time [s]", panels, 4.6, note)
+    pushes = [
+        Curve(funnel.elite.time, funnel.elite.pushes.min(axis=1), funnel.label, funnel.color, style="marked")
+        for funnel in funnels
+        if funnel.elite.pushes is not None
+    ]
+    if pushes:
+        label = f"largest impulse inside\nthe funnel [{volume_unit(config, 'push')}]"
+        panels.append(Panel(label, pushes, logarithmic=True))
+    return Chart("Levels, volumes and pushes", "time [s]", panels, 2.3 * len(panels), note)
 
 
 def volumes(
@@ -146,8 +154,8 @@ def _beside(figure: "Figure", run: Run) -> None:
     draw_panel(below, volumes(config, funnels, functools.partial(_volumes_label, config)))
     below.set_xlabel("time [s]")
     if len(funnels) == 2:
-        first, second = (funnel.elite.volumes for funnel in funnels)
-        ratios = [f"{words(name)} × {second[name] / first[name]:.3g}" for name in VOLUMES]
+        first, second = (_known_volumes(funnel) for funnel in funnels)
+        ratios = [f"{words(name)} × {value / first[name]:.3g}" for name, value in second.items() if name in first]
         below.set_title(f"{funnels[1].label} over {funnels[0].label}: {', '.join(ratios)}")
     # The figure's legend, not the panel's: its width must not squeeze the panels.
     figure.legend(handles=below.lines, loc="outside lower center")
@@ -182,14 +190,20 @@ def visible_limits(
                 yield axis, value
 
 
+def _known_volumes(funnel: FunnelView) -> dict[str, float]:
+    """Those of the list that its run has stored."""
+    return {name: funnel.elite.volumes[name] for name in VOLUMES if name in funnel.elite.volumes}
+
+
 def _volumes_label(config: Config, funnel: FunnelView) -> str:
-    """The four volumes with their guarantee."""
-    volumes = [f"{words(name)} {funnel.elite.volumes[name]:.4g} {volume_unit(config, name)}" for name in VOLUMES]
+    """The volumes with their guarantee."""
+    known = _known_volumes(funnel).items()
+    volumes = [f"{words(name)} {value:.4g} {volume_unit(config, name)}" for name, value in known]
     return f"{funnel.label}: {', '.join(volumes)}\n{guarantee(funnel.elite.record)}"
 
 
 def _short_label(funnel: FunnelView) -> str:
-    volumes = [f"{words(name)} {funnel.elite.volumes[name]:.3g}" for name in VOLUMES]
+    volumes = [f"{words(name)} {value:.3g}" for name, value in _known_volumes(funnel).items()]
     promise = f", ε = {funnel.elite.epsilon:.2g}" if funnel.elite.guarantee == "sampled" else ""
     return f"{funnel.label}: {', '.join(volumes)} ({funnel.elite.guarantee}{promise})"
 

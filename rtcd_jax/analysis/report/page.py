@@ -14,14 +14,14 @@ from pathlib import Path
 
 from rtcd_jax.analysis.report import tables
 from rtcd_jax.analysis.report.canvas import print_chart
-from rtcd_jax.analysis.report.charts import Chart
+from rtcd_jax.analysis.report.charts import Chart, table
 from rtcd_jax.analysis.report.funnels import draw_funnels, draw_over, levels
 from rtcd_jax.analysis.report.plots import planes_of
 from rtcd_jax.analysis.report.progress import charts
-from rtcd_jax.analysis.report.reading import Experiment, Run, compared, funnel_views, read_run
+from rtcd_jax.analysis.report.reading import Experiment, Run, Tolerance, compared, funnel_views, read_run
 from rtcd_jax.analysis.report.tables import Cell, Table
 from rtcd_jax.analysis.report.traces import plots_of
-from rtcd_jax.analysis.report.words import NONE, duration, guarantee, listed, ratio, words
+from rtcd_jax.analysis.report.words import NONE, duration, guarantee, listed, ratio, volume_unit, words
 from rtcd_jax.system.console import Console
 from rtcd_jax.system.errors import UserError
 from rtcd_jax.system.files import replace
@@ -73,10 +73,16 @@ def refresh(folder: Path, console: Console | None = None) -> Path | None:
 
 
 def draw_figures(run: Run) -> list[Path]:
-    """The figures of one run, NAME.png and .pdf in `run.figures`. Raises UserError if they cannot be written."""
+    """The figures of one run, NAME.png and .pdf in `run.figures`, and of charts NAME.csv; the figures' paths.
+
+    Raises UserError if they cannot be written.
+    """
     funnels = draw_over([run], run.figures, "overlay") + draw_funnels(run)
     others = {"levels": levels(run.config, run.funnels, guarantee(run.best.record)), **charts([run])}
-    return funnels + [path for name, chart in others.items() for path in print_chart(chart, run.figures, name)]
+    drawn = [path for name, chart in others.items() for path in print_chart(chart, run.figures, name)]
+    for name, chart in others.items():
+        replace(run.figures / f"{name}.csv", table(chart).encode())
+    return funnels + drawn
 
 
 def render(runs: Sequence[Run]) -> str:
@@ -180,6 +186,9 @@ def _sections(runs: Sequence[Run], funnels: Sequence[str], of_search: Mapping[st
         for experiment in run.experiments:
             name = words(experiment.name) if alone else f"{words(experiment.name)}: {run.name}"
             yield _section(f"Disturbance: {name}", _table(tables.experiment(experiment)), *_pictures(experiment))
+        for tolerated in run.tolerances:
+            name = f"Tolerance: elite {tolerated.elite}" + ("" if alone else f" of {run.name}")
+            yield _section(name, _table(tables.tolerance(run, tolerated)), *_pictures(tolerated))
     yield _section("Provenance", _table(tables.provenance(runs)))
 
 
@@ -206,7 +215,23 @@ def _funnels(runs: Sequence[Run], names: Sequence[str]) -> Iterator[str]:
     yield _note(
         "Shadows of every knot's ellipsoid on the plane of a coordinate and its velocity. A click in the legend hides."
     )
-    yield _plot(levels)
+    yield _plot(levels, "tall")
+    for run in runs:
+        if push := run.best.record.get("push"):
+            whose = f"{run.name}: " if len(runs) > 1 else ""
+            yield _note(whose + _push_margin(run, push))
+
+
+def _push_margin(run: Run, push: Mapping[str, float | None]) -> str:
+    """The statement that the margin makes, and what the limits on the states leave of any funnel."""
+    unit = volume_unit(run.config, "push")
+    most, limits = push["within_limits"], ""
+    if most:
+        limits = f"; there the limits on the states leave no more than {most:.3g} {unit}"
+    return (
+        f"Push margin ({run.best.guarantee}, at the knots): a motion on its nominal stays in the funnel "
+        f"after an impulse of up to {push['margin']:.3g} {unit}; the least is that at {push['time']:.3g} s{limits}."
+    )
 
 
 def _certified(runs: Sequence[Run]) -> Iterator[str]:
@@ -223,8 +248,8 @@ def _certified(runs: Sequence[Run]) -> Iterator[str]:
             yield _note(whose + correlation)
 
 
-def _pictures(experiment: Experiment) -> Iterator[str]:
-    for path in experiment.pictures:
+def _pictures(experiment: Experiment | Tolerance) -> Iterator[str]:
+    for path in (each for each in experiment.pictures if each.is_file()):
         data = base64.b64encode(path.read_bytes()).decode()
         picture = f'<img src="data:image/png;base64,{data}" alt="{html.escape(words(path.stem))}">'
         yield f'<div class="scroll">{picture}</div>'

@@ -22,7 +22,7 @@ from rtcd_jax.elite.records import (
 from rtcd_jax.system.console import Console, each_second, silent
 from rtcd_jax.system.errors import UserError, printable
 from rtcd_jax.system.files import read_json, reading
-from rtcd_jax.volume import VOLUMES
+from rtcd_jax.volume import LATER, VOLUMES
 
 # Okabe and Ito's colors: distinct in all kinds of color vision.
 BLUE, VERMILION = "#0072B2", "#D55E00"
@@ -52,6 +52,8 @@ _VERIFICATION = {
     "states": _NUMBER, "epsilon": _NUMBER, "confidence": _NUMBER, "witnesses": {_ANY_KEY: _COUNTS},
 }  # fmt: skip
 _DISTURBANCE = {"summary": {}}
+_TOLERATED = {"name": str, "unit": str, "half_width": _NUMBER, "factor": _NUMBER, "borne": _NUMBER}
+_TOLERANCE = {"rows": [{**_TOLERATED, "volumes": {_ANY_KEY: _NUMBER}}]}
 
 
 @final
@@ -71,6 +73,16 @@ class Experiment:
 
     name: str
     summary: Mapping[str, Any]
+    pictures: tuple[Path, ...]
+
+
+@final
+@dataclass(frozen=True)
+class Tolerance:
+    """`tolerance/NNN.json`: the largest factor of each uncertainty that the elite bears, and its figure."""
+
+    elite: str
+    rows: Sequence[Mapping[str, Any]]
     pictures: tuple[Path, ...]
 
 
@@ -114,6 +126,7 @@ class Run:
     certificates: Mapping[str, Certificate]
     verification: Mapping[str, Mapping[str, Any]]
     experiments: Sequence[Experiment]
+    tolerances: Sequence[Tolerance]
     provenance: Mapping[str, Any]
     audited: bool = False
     labels: tuple[str, str] = ("initial", "best")
@@ -158,6 +171,10 @@ def read_run(path: Path, console: Console | None = None) -> Run:
             file.stem: _shaped(file, _VERIFICATION) for file in sorted((path / "verification").glob("*.json"))
         },
         experiments=tuple(_experiments(path / "disturbance")),
+        tolerances=tuple(
+            Tolerance(file.stem, _shaped(file, _TOLERANCE).get("rows", ()), (file.with_suffix(".png"),))
+            for file in sorted((path / "tolerance").glob("*.json"))
+        ),
         provenance=_shaped(path / "provenance.json", _PROVENANCE),
         audited=(path / AUDIT).is_file(),
     )
@@ -165,7 +182,7 @@ def read_run(path: Path, console: Console | None = None) -> Run:
 
 def _require_shown(name: str, elite: Elite) -> None:
     """Raises UserError where something is missing that reports tell of a candidate."""
-    missing = [f"volumes_{volume}" for volume in VOLUMES if volume not in elite.volumes]
+    missing = [f"volumes_{volume}" for volume in VOLUMES if volume not in elite.volumes and volume not in LATER]
     missing += [key for key in ("design", "weights") if key not in elite.record]
     if missing:
         raise UserError(f"the {name} candidate lacks {', '.join(missing)}")

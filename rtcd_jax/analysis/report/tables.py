@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Any, cast, final
 
 from rtcd_jax.analysis.report.history import OPTIONS
-from rtcd_jax.analysis.report.reading import Experiment, Run
+from rtcd_jax.analysis.report.reading import Experiment, Run, Tolerance
 from rtcd_jax.analysis.report.words import duration, ratio, volume_unit, words
 from rtcd_jax.volume import VOLUMES
 
@@ -69,7 +69,7 @@ def elites(run: Run) -> Table:
         weights = (*record["weights"]["q"], *record["weights"]["r"])
         row = (
             name, *record["design"].values(), *weights, *(record["policy"][name] for name in options),
-            *(volumes[key] for key in VOLUMES),
+            *(volumes.get(key) for key in VOLUMES),
             ratio(volumes["sum"], before), 100 * volumes["share_of_largest_knot"], record["duration"],
             record["epsilon"], record["rung"],
             *([_percent(record.get("spread"))] if varied else []),
@@ -142,6 +142,18 @@ def experiment(record: Experiment) -> Table:
     return Table(("", ""), tuple((words(name), _cell(value)) for name, value in summary.items()))
 
 
+def tolerance(run: Run, tolerated: Tolerance) -> Table:
+    """The largest factor of each uncertainty that a funnel bears, and its volumes there."""
+    volumes = [f"{words(name)} [{volume_unit(run.config, name)}]" for name in VOLUMES]
+    heads = ("uncertainty", "unit", "half width", "largest factor", "borne", *volumes, "guarantee")
+    keys = ("name", "unit", "half_width", "factor", "borne")
+    rows = [
+        (*(row.get(key) for key in keys), *(row.get("volumes", {}).get(name) for name in VOLUMES), "sampled")
+        for row in tolerated.rows
+    ]
+    return Table(heads, tuple(rows))
+
+
 def provenance(runs: Sequence[Run]) -> Table:
     """Which program made the runs, where and when."""
     heads = (*_run_head(runs), "", "")
@@ -155,9 +167,9 @@ def wall_time(run: Run) -> str | None:
 
 def _gains_of(run: Run) -> Iterator[tuple[Cell, ...]]:
     searched = run.config.search.objective
-    order = (searched, *(name for name in VOLUMES if name != searched))
+    order = (searched, *(name for name in VOLUMES if name != searched and name in run.best.volumes))
     for name in order:
-        before, after = run.initial.volumes[name] if run.initial else None, run.best.volumes[name]
+        before, after = run.initial.volumes.get(name) if run.initial else None, run.best.volumes[name]
         label = f"{words(name)} (searched)" if name == searched else words(name)
         times = ratio(after, before) if before is not None else None
         yield label, volume_unit(run.config, name), before, after, times, wall_time(run), run.best.guarantee
@@ -175,7 +187,7 @@ def _compared(run: Run, options: Sequence[str]) -> tuple[Cell, ...]:
     return (
         run.name, f"{words(config.search.objective)}, {config.search.mode}", *record["design"].values(),
         *record["weights"]["q"], *record["weights"]["r"], *(record["policy"][name] for name in options),
-        *(run.best.volumes[name] for name in VOLUMES),
+        *(run.best.volumes.get(name) for name in VOLUMES),
         ratio(run.best.volumes["sum"], before) if before is not None else None, record["rung"],
         *((certificate.shown["sum"], certificate.guarantee) if certificate and certificate.shown else (None, None)),
         verdict(run), wall_time(run),

@@ -12,13 +12,14 @@ from rtcd_jax.volume import VOLUMES
 NONE = "–"
 """Stands where there is no number."""
 
+_WORDS = {"inlet": "initial ellipsoid", "push": "push margin"}
 _GREEK = {"alpha": "α", "beta": "β", "gamma": "γ", "phi": "φ", "psi": "ψ", "theta": "θ"}
 _POWERS = str.maketrans("0123456789", "⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 
 def words(name: str) -> str:
     """A stored name as it is read; the inlet is the first knot's ellipsoid."""
-    return "initial ellipsoid" if name == "inlet" else name.replace("_", " ")
+    return _WORDS.get(name, name.replace("_", " "))
 
 
 def letter(name: str) -> str:
@@ -39,7 +40,12 @@ def quantity(name: str, unit: str) -> str:
 
 
 def volume_unit(config: Config, volume: str = "sum") -> str:
-    """That of a volume, the product of the states' units with equal ones as powers; some have a second more."""
+    """That of a volume, the product of the states' units with equal ones as powers; some have a second more.
+
+    A push has the unit of an input times a second.
+    """
+    if VOLUMES[volume].push:
+        return "·".join([*next(iter(config.plant.inputs.values())).split(), "s"])
     powers = Counter({"s": VOLUMES[volume].seconds})
     for unit in config.plant.states.values():
         above, _, below = unit.partition("/")

@@ -18,7 +18,7 @@ from rtcd_jax.certificate.prove.closed_loop import linear
 from rtcd_jax.elite.elite import CLAIMED
 from rtcd_jax.system.delimited import number_or_nan, read_table, shown
 from rtcd_jax.system.errors import UserError, closest, printable
-from rtcd_jax.volume import VOLUMES
+from rtcd_jax.volume import VOLUMES, Knots, largest_pushes
 
 EVEN = 1e-6
 """Share of an interval by which the knots' times may be off an even grid."""
@@ -205,18 +205,19 @@ class Cost(NamedTuple):
 def elite_of(external: ExternalFunnel, cost: Cost) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     """Arrays and record as `elites/NNN` has them; the gains are R^-1 B'S, and the goal's those of the last knot."""
     inputs = np.append(external.u, 0.0)
-    gains = [
-        linear(external.plant, external.parameters, x, u)[1] @ s / cost.r
-        for x, u, s in zip(external.x, inputs, external.S, strict=True)
-    ]
-    volumes = external.volumes
-    named = {name: volume.of(volumes, np.log(volumes), external.dt) for name, volume in VOLUMES.items()}
+    jumps = np.array(
+        [linear(external.plant, external.parameters, x, u)[1] for x, u in zip(external.x, inputs, strict=True)]
+    )
+    gains = [b @ s / cost.r for b, s in zip(jumps, external.S, strict=True)]
+    volumes, pushes = external.volumes, largest_pushes(external.S, external.rho, jumps[:, :, None])
+    at = Knots(volumes, np.log(volumes), pushes, external.dt)
+    named = {name: volume.of(at) for name, volume in VOLUMES.items()}
     arrays = {
         "time": external.dt * np.arange(len(external.x)), "x": external.x, "u": external.u[:, None],
         "K": np.array(gains)[:, None], "S": external.S, "rho": external.rho,
         "Q": np.diag(cost.q), "R": np.array([[cost.r]]),
         "K_goal": gains[-1][None], "x_goal": external.goal, "u_max": np.array([external.limit]),
-        "volumes_per_knot": volumes, **{f"volumes_{name}": value for name, value in named.items()},
+        "volumes_per_knot": volumes, "pushes": pushes, **{f"volumes_{name}": value for name, value in named.items()},
     }  # fmt: skip
     record = {
         "plant": external.name,

@@ -1,5 +1,6 @@
 """`rtcd disturb` on a run folder: records and figures, deterministic by seed, and clear refusals."""
 
+import dataclasses
 import json
 import shutil
 
@@ -20,12 +21,12 @@ from rtcd_jax.system.errors import UserError
 from tests.consoles import Screen
 from tests.export.folders import run_folder
 
-NAMES = ("off_nominal", "impulse", "robustness")
+NAMES = ("off_nominal", "impulse", "push_margin", "robustness")
 
 
 SMALL = {
-    experiments: {"FACTORS": (1, 4), "TIMES": 5, "SIZES": 7, "LEVELS": 5, "REPEATS": 2, "PROFILES": 6},
-    disturb: {"FACTORS": (1, 4), "TIMES": 5, "SIZES": 7},
+    experiments: {"FACTORS": (1, 4), "TIMES": 5, "SIZES": 7, "KICKS": 4, "LEVELS": 5, "REPEATS": 2, "PROFILES": 6},
+    disturb: {"FACTORS": (1, 4), "TIMES": 5, "SIZES": 7, "KICKS": 4},
     contests: {"BATCH": 256, "REPORTED": 0.0},
 }
 
@@ -67,9 +68,29 @@ def test_every_experiment_leaves_its_record_and_its_figures(disturbed):
         "recovered",
         "score",
         "control rate",
-        "3 records and 6 figures",
+        "sudden ones up to [N m s]",
+        "4 records and 8 figures",
     ):
         assert words in text
+
+
+def test_a_push_inside_the_funnel_is_recovered_from_and_one_that_only_a_false_level_contains_is_not(pendulums):
+    """The margin is never above what is tolerated; with levels that are far too large it is, and 0 is tolerated."""
+    false = dataclasses.replace(pendulums.elites[1], rho=900 * pendulums.elites[1].rho)
+    comparison = dataclasses.replace(pendulums, elites=(pendulums.elites[0], false))
+    record = experiments.push_margin(
+        comparison, lambda rollouts, name, settles: run(comparison, rollouts, 0, name, Meter(silent(), 1), settles)
+    )
+    inside, tolerated = (
+        np.array([record[key][name] for name in comparison.names]) for key in ("inside_funnel", "tolerated")
+    )
+    assert np.all(tolerated[0] >= inside[0])
+    p = comparison.elites[0].parameters
+    expected = p["m"] * p["l"] ** 2 * np.sqrt(comparison.elites[0].rho / comparison.elites[0].S[:, 1, 1])
+    np.testing.assert_allclose(inside[0], expected, rtol=1e-8)
+    assert np.all(tolerated[1] == 0)
+    assert record["summary"]["initial"]["push_margin"] == pytest.approx(expected.min())
+    assert record["summary"]["best"]["tolerated_at_all_times"] == 0
 
 
 def test_the_same_seed_gives_the_same_records_and_another_one_others(disturbed, tmp_path):

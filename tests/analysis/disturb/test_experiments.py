@@ -21,6 +21,7 @@ from rtcd_jax.analysis.disturb.experiments import (
     robustness,
 )
 from rtcd_jax.analysis.disturb.scenarios import STEP, Outcome
+from rtcd_jax.export.rate import control_rate
 
 
 class Judge:
@@ -94,10 +95,10 @@ def test_every_trouble_changes_what_it_names_and_nothing_else(robots):
     level = np.array([0.0, 0.01])
     changed = {
         "velocity noise": "velocity_noise", "torque noise": "input_noise", "response time": "lag", "delay": "delay",
-        "input limit": "actuator_scale",
+        "input limit": "actuator_scale", "dry friction": "friction",
     }  # fmt: skip
     for perturbation in perturbations(robots):
-        if perturbation.name in ("perturbation", "control rate"):
+        if perturbation.name in ("perturbation", "control rate", "hold"):
             continue
         rollouts = perturbation.apply(plain, level, random)
         if perturbation.name in changed:
@@ -117,6 +118,16 @@ def test_every_trouble_changes_what_it_names_and_nothing_else(robots):
     assert "gravity" not in names
     assert "input limit" in names
     assert set(robots.plant.design_units) < set(names)
+
+
+def test_a_hold_is_so_many_periods_of_the_loop_s_own_export(robots):
+    """To whole steps of the simulation, one at least."""
+    (hold,) = (perturbation for perturbation in perturbations(robots) if perturbation.name == "hold")
+    plain = experiments.from_start(robots, np.repeat([0, 1], len(hold.levels)))
+    held = hold.apply(plain, np.tile(hold.levels, 2), None)
+    expected = np.outer([control_rate(elite, None).period or STEP for elite in robots.elites], hold.levels)
+    np.testing.assert_allclose(np.asarray(held.period).reshape(2, -1) * STEP, expected, atol=0.51 * STEP)
+    assert np.all(held.period >= 1)
 
 
 def test_rates_and_delays_are_whole_steps(robots):

@@ -12,7 +12,7 @@ LEVELS = [-0.25, 0.0, 0.25]
 
 
 def records(names):
-    """All three experiments of the named controllers."""
+    """All experiments of the named controllers."""
     shares = {key: 0.5 for name in names for key in (name, f"{name} lower", f"{name} upper")}
     return {
         "off_nominal": {
@@ -24,6 +24,13 @@ def records(names):
             "times": {name: [0.1, 0.2] for name in names},
             "recovered": {name: [[True, True, False], [False, True, True]] for name in names},
             "summary": {name: {"recovered": 2 / 3, "largest_at_all_times": 0.0} for name in names},
+        },
+        "push_margin": {
+            "impulse_unit": "N m s",
+            "times": {name: [0.1, 0.2] for name in names},
+            "inside_funnel": {name: [0.2, 0.1] for name in names},
+            "tolerated": {name: [0.3, 0.0] for name in names},
+            "summary": {name: {"push_margin": 0.1, "tolerated_at_all_times": 0.0} for name in names},
         },
         "robustness": {
             "troubles": [
@@ -47,7 +54,9 @@ def folder_of(path, names):
 def test_every_record_becomes_a_picture_and_a_print(tmp_path, names):
     paths = draw_disturbance(folder_of(tmp_path, names))
     assert [path.name for path in paths] == [
-        f"{name}.{suffix}" for name in ("off_nominal", "impulse", "robustness") for suffix in ("png", "pdf")
+        f"{name}.{suffix}"
+        for name in ("off_nominal", "impulse", "push_margin", "robustness")
+        for suffix in ("png", "pdf")
     ]
     assert all(path.stat().st_size > 1000 for path in paths)
 
@@ -63,10 +72,20 @@ def test_the_heat_map_has_every_cell_at_its_time_and_impulse(tmp_path, figures):
 
 def test_strips_say_levels_in_their_unit(tmp_path, figures):
     draw_disturbance(folder_of(tmp_path, ["best"]))
-    panels = figures[4].axes
+    panels = figures[6].axes
     labels = [[label.get_text() for label in axes.get_xticklabels()] for axes in panels]
-    assert labels == [["-25%", "0%", "+25%"], ["0", "0.05"]]
-    assert [axes.get_title(loc="left") for axes in panels] == ["mass [relative]", "delay [s]"]
+    assert labels == [["0", "0.05"], ["-25%", "0%", "+25%"]]
+    assert [axes.get_title(loc="left") for axes in panels] == ["delay [s]", "mass [relative]"]
+
+
+def test_what_fails_first_stands_first(tmp_path, figures):
+    folder = folder_of(tmp_path, ["initial", "best"])
+    path = folder / "disturbance" / "robustness.json"
+    record = json.loads(path.read_text())
+    record["troubles"][0]["success"] = {"initial": [1, 1, 1], "best": [0, 0, 1]}
+    path.write_text(json.dumps(record))
+    draw_disturbance(folder)
+    assert [axes.get_title(loc="left") for axes in figures[6].axes] == ["mass [relative]", "delay [s]"]
 
 
 def test_a_record_that_is_not_there_or_damaged_is_named(tmp_path):

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from rtcd_jax.analysis.disturb.scenarios import CHUNK, STEP, Loops, advance, start, undisturbed
+from rtcd_jax.analysis.disturb.scenarios import CHUNK, STEP, Loops, advance, motor_speeds, start, undisturbed
 from rtcd_jax.elite.closed_loop import ClosedLoop, runge_kutta
 from rtcd_jax.elite.simulators import CLOSED_FORMS
 
@@ -70,6 +70,26 @@ def test_undisturbed_motions_are_the_verifications_up_to_the_hold(robots):
     found = np.asarray(motion.x[:, :8].T)
     np.testing.assert_allclose(found - found[0], x - x[0], atol=1e-2 * np.abs(offsets).max())
     assert not motion.left.any()
+
+
+def test_dry_friction_takes_its_force_times_the_path_of_the_motor(robots):
+    """From the energy of a robot without dampers, motors off: the first joint is the motor's on both robots."""
+    off = with_law(robots, K=np.zeros_like, u=np.zeros_like, K_goal=np.zeros_like)
+    x = np.zeros((2, robots.plant.n))
+    x[:, robots.plant.n // 2] = 3.0, -3.0
+    free = rollouts_of(off, [0, 1], x)
+    for name in (name for name in vars(robots.plant) if name.endswith("damping")):
+        free = eqx.tree_at(lambda r, name=name: getattr(r.plant, name), free, jnp.zeros(COUNT))
+    force = 0.05 * robots.elites[0].u_max[0]
+    rubbed = dataclasses.replace(free, friction=jnp.full((1, COUNT), force), slips=jnp.full((1, COUNT), 1e-3))
+    np.testing.assert_allclose(motor_speeds(free.plant, free.design, free.x)[0], free.x[robots.plant.n // 2], rtol=1e-9)
+    ends = [moved(off, each).x[:, :2] for each in (free, rubbed)]
+    design = jax.tree.map(lambda leaf: leaf[:2], free.design)
+    plant = jax.tree.map(lambda leaf: leaf[:2], free.plant)
+    before, kept, after = (np.asarray(plant.energy(design, jnp.asarray(state))) for state in (x.T, *ends))
+    np.testing.assert_allclose(kept, before, rtol=1e-6)
+    assert np.all(np.abs(ends[1][0]) > 0.1)
+    np.testing.assert_allclose(before - after, force * np.abs(ends[1][0]), rtol=2e-3)
 
 
 def _oracle(comparison, index, x, seconds, *, actuator_scale, period, delay, lag, center, width, height, scale):

@@ -6,7 +6,7 @@ from matplotlib.collections import PolyCollection
 from matplotlib.text import Text
 
 from rtcd_jax.analysis.report.funnels import draw_funnels, draw_over
-from rtcd_jax.analysis.report.page import draw_figures
+from rtcd_jax.analysis.report.page import draw_figures, render
 from rtcd_jax.analysis.report.reading import compared, read_run
 from rtcd_jax.analysis.report.shapes import outlines, planes, projections
 from tests.analysis.report.runs import candidate, experiment, finished, run_folder
@@ -171,6 +171,29 @@ def test_levels_and_volumes_of_every_knot_are_drawn_over_time(run, figures):
             np.testing.assert_array_equal(axes.lines[i].get_xydata(), np.stack([arrays["time"], arrays[name]], axis=1))
     assert (levels.get_yscale(), volumes.get_yscale()) == ("log", "log")
     assert "sampled: failure probability" in texts(levels_figure)
+
+
+def test_pushes_are_drawn_and_written_where_a_run_stored_them(tmp_path, figures):
+    """The initial candidate's is of an older version that stored none; the page tells the best one's margin."""
+    config = experiment()
+    pushes = np.geomspace(0.5, 0.1, len(candidate(config)[0]["rho"]))
+    arrays, record = candidate(config, 1)
+    told = {"push": {"margin": 0.1, "input": "torque", "time": 1.8, "within_limits": 0.25}}
+    best = arrays | {"pushes": pushes[:, None], "volumes_push": np.array(0.1)}, record | told
+    run = read_run(run_folder(tmp_path / "run", config, candidate(config), best))
+    draw_figures(run)
+    (figure,) = {drawn for drawn in figures if "level ρ" in drawn.axes[0].get_ylabel()}
+    (line,) = figure.axes[2].lines
+    np.testing.assert_array_equal(line.get_xydata(), np.stack([arrays["time"], pushes], axis=1))
+    assert "N·m·s" in figure.axes[2].get_ylabel()
+    rows = (tmp_path / "run" / "figures" / "levels.csv").read_text().splitlines()
+    stored = [row.split(",")[1:] for row in rows if row.startswith("largest impulse")]
+    assert stored == [
+        ["best", repr(t), repr(push)] for t, push in zip(arrays["time"].tolist(), pushes.tolist(), strict=True)
+    ]
+    text = render([run])
+    assert "after an impulse of up to 0.1 N·m·s; the least is that at 1.8 s" in text
+    assert "leave no more than 0.25 N·m·s" in text
 
 
 def test_compared_funnels_lie_over_one_another_the_largest_lowest(tmp_path, figures):

@@ -142,6 +142,22 @@ def test_pictures_of_an_experiment_are_in_the_page(tmp_path, pages):
     assert "<img" not in pages["pendulum"].read_text()
 
 
+def test_what_a_funnel_tolerates_is_in_the_page(tmp_path):
+    run = finished(tmp_path / "run")
+    mass = {"name": "mass", "unit": "-", "half_width": 0.02, "factor": 1.75, "borne": 0.035, "volumes": {"sum": 7.5}}
+    rows = [mass, {"name": "whole box", "unit": "", "half_width": None, "factor": 0.5, "borne": None}]
+    (run / "tolerance").mkdir()
+    (run / "tolerance" / "001.json").write_text(json.dumps({"rows": rows}))
+    (run / "tolerance" / "001.png").write_bytes(b"picture")
+    text = render([read_run(run)])
+    assert "Tolerance: elite 001" in text
+    assert all(f'data-value="{number!r}"' in text for number in (1.75, 0.035, 7.5))
+    assert '<img src="data:image/png;base64,cGljdHVyZQ=="' in text
+    (run / "tolerance" / "001.json").write_text(json.dumps({"rows": [3]}))
+    with pytest.raises(UserError, match=r"cannot read .*001.json: rows\[0\] is of another kind than a run writes"):
+        read_run(run)
+
+
 def test_a_page_that_is_there_is_brought_up_to_date_and_none_is_made(tmp_path):
     run = finished(tmp_path / "run")
     assert refresh(run) is None
