@@ -54,7 +54,7 @@ def plan(problem: Problem, candidates: Candidate) -> Trajectory:
         start=problem.start,
         goal=problem.goal,
         state_limits=settings.limit_share * problem.state_limits,
-        input_limits=problem.input_limits,
+        input_limits=settings.input_share * problem.input_limits,
         step_limits=(settings.step.min, settings.step.max),
     )
     most = settings.max_iterations

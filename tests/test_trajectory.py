@@ -215,6 +215,20 @@ def test_shapes_are_those_of_the_nouns(planned, problem):
 
 
 @pytest.mark.slow
+def test_a_share_of_the_motor_is_left_to_the_controller(problem, draw):
+    """The motion needs no more than its share, which costs; the controller's limit is the motor's."""
+    candidates = draw(8)
+    whole = jax.jit(partial(plan, problem))(candidates)
+    spared = jax.jit(partial(plan, with_trajectory(problem, input_share=0.8)))(candidates)
+    both = np.asarray((whole.status == Status.OK) & (spared.status == Status.OK))
+    assert np.sum(both) >= 6
+    limit = float(problem.input_limits[0])
+    assert np.max(np.abs(whole.us[both])) > 0.99 * limit
+    assert np.max(np.abs(spared.us[both])) <= 0.8 * limit * (1 + 1e-9)
+    assert np.all(spared.cost[both] >= whole.cost[both] * (1 - 1e-3))
+
+
+@pytest.mark.slow
 def test_a_given_duration_is_kept_to_the_last_bit(problem, draw):
     """The cost can only rise above that of the free step, whose box holds the fixed one."""
     candidates, step = draw(8), type(problem.config.trajectory.step)(min=0.07, max=0.07)

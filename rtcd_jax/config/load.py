@@ -263,6 +263,8 @@ def config_hash(config: Config) -> str:
         del stated["uncertainty"]  # as before there was such a section
     if not config.search.at_least:
         del stated["search"]["at_least"]
+    if config.trajectory.input_share == 1:
+        del stated["trajectory"]["input_share"]
     canonical = json.dumps(stated, sort_keys=True, separators=(",", ":"))
     return hashlib.sha256(canonical.encode()).hexdigest()[:12]
 

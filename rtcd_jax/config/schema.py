@@ -175,6 +175,12 @@ class TrajectoryConfig(Settings):
         le=1,
         description="share of the state limits for the nominal motion; the rest is the funnel's [-]",
     )
+    input_share: float = Field(
+        default=1.0,
+        ge=0.01,
+        le=1,
+        description="share of the input limits for the nominal motion; the rest is the tracking controller's [-]",
+    )
     max_iterations: int = Field(default=200, ge=1, le=100_000, description="iterations of the trajectory optimizer [-]")
     starts: int = Field(
         default=1, ge=1, le=2, description="starts to solve, the cheapest is kept; where all fail, others follow [-]"

@@ -195,6 +195,8 @@ ENDS = [
     ("trajectory.starts", 2, 3),
     ("trajectory.limit_share", 0.6, 5e-324),
     ("trajectory.limit_share", 1, 1.01),
+    ("trajectory.input_share", 0.8, 0),
+    ("trajectory.input_share", 1, 1.01),
     ("funnel.mjx_share", 1, 1.001),
     ("funnel.mjx_share", 1e-9, 0),
     ("funnel.directions", 1, 0),
@@ -425,6 +427,13 @@ def test_the_hash_ignores_spelling_and_sees_values():
     reordered["design"] = dict(reversed(reordered["design"].items()))
     assert config_hash(parse(reordered)) == config_hash(config)
     assert config_hash(parse(changed({"plant.damping": math.nextafter(0.1, 1)}))) != config_hash(config)
+
+
+def test_keys_that_came_later_leave_the_hash_of_those_who_do_not_use_them():
+    """Stored runs carry their hash."""
+    assert config_hash(parse_yaml(EXAMPLE)) == "699114ffc6eb"
+    for change in {"search.at_least": {"push": 0.1}}, {"trajectory.input_share": 0.9}, {"uncertainty": {"age": 0.1}}:
+        assert config_hash(parse(changed(change))) != "699114ffc6eb"
 
 
 def test_differences_are_exactly_the_changes():
