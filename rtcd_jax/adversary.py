@@ -14,6 +14,7 @@ V = e'S(t)e fastest: the signs of dV'/du and of dV'/dp, one reverse sweep for al
 first order in the parameters: the held-out samples are those of `Drawn` robots, which are what epsilon is about.
 """
 
+from collections.abc import Callable
 from typing import Any, NamedTuple, TypeVar, final
 
 import equinox as eqx
@@ -24,6 +25,14 @@ from jaxtyping import Array, Float, Int, PRNGKeyArray
 from rtcd_jax.numerics.integrate import split
 from rtcd_jax.plants.base import Plant
 from rtcd_jax.types import Uncertainty
+
+RobotRate = Callable[[Plant, eqx.Module, Array, Array], Array]
+"""plant, design, x [n ...], u [m ...] -> x' [n ...]; the numbers of both are broadcast to the states' trailing axes."""
+
+
+def closed_form_rate(plant: Plant, design: eqx.Module, x: Array, u: Array) -> Array:
+    """The plant's own equations."""
+    return plant.dynamics(design, x, u)
 
 
 class Situation(NamedTuple):
@@ -96,6 +105,8 @@ class Drawn(NamedTuple):
     noise: Float[Array, "n S"]
     steady: Float[Array, " S"]
     key: PRNGKeyArray
+    motion: RobotRate = closed_form_rate
+    """Whose equations of motion."""
 
     @classmethod
     def of(cls, plant: Plant, uncertainty: Uncertainty, key: PRNGKeyArray, samples: int) -> "Drawn":
@@ -136,7 +147,7 @@ class Drawn(NamedTuple):
         bounds = at.bounds * (1 + may.input_limit * self.input_limit)
         u = jnp.clip(asked, -bounds, bounds) + may.input * self.input.reshape(-1, *(1,) * (x.ndim - 2), x.shape[-1])
         scales = {name: 1 + width * self.parameters[name] for name, width in may.parameters.items()}
-        return split(scaled_rate(self.plant, design, scales, x, u))
+        return split(scaled_rate(self.plant, design, scales, x, u, self.motion))
 
 
 Opponent = Worst | Drawn
@@ -150,11 +161,12 @@ def scaled_rate(
     scales: dict[str, Float[Array, "*#batch"]],
     x: Float[Array, "n *batch"],
     u: Float[Array, "m *batch"],
+    motion: RobotRate = closed_form_rate,
 ) -> Float[Array, "n *batch"]:
     """x' of the robot whose design fields and constants of these names are scaled."""
     in_design = {name: scale for name, scale in scales.items() if hasattr(design, name)}
     in_plant = {name: scale for name, scale in scales.items() if name not in in_design}
-    return _scaled(plant, in_plant).dynamics(_scaled(design, in_design), x, u)
+    return motion(_scaled(plant, in_plant), _scaled(design, in_design), x, u)
 
 
 def _scaled(part: Part, scales: dict[str, Any]) -> Part:

@@ -138,7 +138,7 @@ def compare_with_mjx(problem: Problem, evaluation: Evaluation, key: PRNGKeyArray
     """`elites.mjx_states` held-out samples of one candidate's funnel, followed to the goal by both physics."""
     funnel, config = evaluation.funnel, problem.config
     rollouts = Rollouts.of(problem, evaluation.candidate, funnel.policy, config.funnel)
-    return compare_physics(rollouts, funnel.levels, key, config.elites.mjx_states, rollout.mjx(problem.plant))
+    return compare_physics(rollouts, funnel.levels, key, config.elites.mjx_states)
 
 
 def _assess(

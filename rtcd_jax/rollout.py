@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from rtcd_jax.adversary import Opponent, Situation
+from rtcd_jax.adversary import Drawn, Opponent, Situation
 from rtcd_jax.numerics.integrate import END, MIDDLE, START, rk4_varying_step, split
 from rtcd_jax.numerics.loops import short_scan
 from rtcd_jax.plants.base import Plant
@@ -40,18 +40,30 @@ def closed_form(plant: Plant, opponent: Opponent | None = None) -> Dynamics:
     return Dynamics(plant.dynamics, large=False, opponent=opponent)
 
 
-def mjx(plant: Plant) -> Dynamics:
-    """The plant's MJCF under MJX."""
+def mjx(plant: Plant, drawn: Drawn | None = None) -> Dynamics:
+    """The plant's MJCF under MJX; of the `drawn` robots, each with its own edits of the model."""
+    if drawn is not None:
+        return Dynamics(plant.dynamics, large=True, opponent=drawn._replace(motion=mjx_rate))
+    return Dynamics(partial(mjx_rate, plant), large=True)
+
+
+def mjx_rate(
+    plant: Plant, design: eqx.Module, x: Float[Array, "n *batch"], u: Float[Array, "m *batch"]
+) -> Float[Array, "n *batch"]:
+    """x' by MJX; the numbers of plant and design are broadcast to the states' trailing axes."""
     from rtcd_jax.plants.mjx import MjxStepper  # mujoco takes seconds to import
 
-    stepper = MjxStepper(plant)
+    def one(robot: tuple[Plant, eqx.Module], x, u):
+        return MjxStepper(robot[0]).dynamics(robot[1], x, u)
 
-    def rate(design: eqx.Module, x: Float[Array, "n *batch"], u: Float[Array, "m *batch"]) -> Float[Array, "n *batch"]:
-        over_states = jax.vmap(partial(stepper.dynamics, design), in_axes=-1, out_axes=-1)
-        flat = over_states(x.reshape(plant.n, -1), u.reshape(plant.m, -1))
-        return flat.reshape(x.shape)
+    robot, axes = (plant, design), jax.tree.map(lambda leaf: -1 if jnp.ndim(leaf) else None, (plant, design))
+    flat = jax.tree.map(lambda leaf: _flattened(leaf, x.shape[1:]) if jnp.ndim(leaf) else leaf, robot)
+    over_states = jax.vmap(one, in_axes=(axes, -1, -1), out_axes=-1)
+    return over_states(flat, x.reshape(plant.n, -1), u.reshape(plant.m, -1)).reshape(x.shape)
 
-    return Dynamics(rate, large=True)
+
+def _flattened(leaf, shape: tuple[int, ...]):
+    return jnp.broadcast_to(leaf, shape).reshape(-1)
 
 
 class TrackingData(NamedTuple):

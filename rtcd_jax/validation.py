@@ -310,10 +310,17 @@ class _Pair(NamedTuple):
 
 
 def compare_physics(
-    rollouts: Rollouts, levels: Float[Array, " knots"], key: PRNGKeyArray, states: int, mjx: rollout.Dynamics
+    rollouts: Rollouts,
+    levels: Float[Array, " knots"],
+    key: PRNGKeyArray,
+    states: int,
+    mjx: Callable[..., rollout.Dynamics] = rollout.mjx,
 ) -> PhysicsComparison:
-    """Follows `states` new states, spread evenly over the knots' ellipsoids, by the closed form and by `mjx`."""
-    closed_form = rollout.closed_form(rollouts.problem.plant)
+    """Follows `states` new states, spread evenly over the knots' ellipsoids, by the closed form and by `mjx`.
+
+    Under an uncertainty every state has a drawn robot of its own, the same in both.
+    """
+    plant, uncertainty = rollouts.problem.plant, rollouts.problem.uncertainty
     knots = levels.shape[0]
     blocks = -(-states // _MJX_BLOCK)
     born = np.sort(np.arange(states) % knots)
@@ -324,12 +331,17 @@ def compare_physics(
 
     def block(_, mine):
         number, born = mine
-        x = rollouts.uniform(levels, born, jax.random.fold_in(key, number))
+        key_of_block = jax.random.fold_in(key, number)
+        x = rollouts.uniform(levels, born, key_of_block)
+        robots = None
+        if uncertainty is not None:
+            robots = Drawn.of(plant, uncertainty, jax.random.fold_in(key_of_block, 1), born.shape[0])
 
         def forward(k, pair: _Pair) -> _Pair:
             started = born <= k
-            ends, _ = rollouts.interval(pair.closed_form, k, closed_form)
-            other, inside = rollouts.interval(pair.mjx, k, mjx)
+            drawn = robots if robots is None else robots.at_knot(k)
+            ends, _ = rollouts.interval(pair.closed_form, k, rollout.closed_form(plant, drawn))
+            other, inside = rollouts.interval(pair.mjx, k, mjx(plant, drawn))
             left = started & ~(inside & (rollouts.level(other, k + 1) <= levels[k + 1]))
             pair = pair._replace(
                 closed_form=jnp.where(started, ends, pair.closed_form),
@@ -341,8 +353,8 @@ def compare_physics(
 
         nothing = jnp.zeros(born.shape, bool), jnp.full(born.shape, -1.0), born, jnp.stack([x, x])
         pair = jax.lax.fori_loop(born[0], knots - 1, forward, _Pair(x, x, *nothing))
-        ends, _ = rollouts.arrive(pair.closed_form, closed_form, levels[-1])
-        other, arrives = rollouts.arrive(pair.mjx, mjx, levels[-1])
+        ends, _ = rollouts.arrive(pair.closed_form, rollout.closed_form(plant, robots), levels[-1])
+        other, arrives = rollouts.arrive(pair.mjx, mjx(plant, robots), levels[-1])
         pair = pair._replace(closed_form=ends, mjx=other, failed=pair.failed | ~arrives)
         return None, (pair.seen(knots, difference(ends, other, knots - 1)), x)
 

@@ -146,6 +146,18 @@ def test_no_width_is_the_nominal_loop():
         np.testing.assert_allclose(jnp.stack(opponent.rate(design, at)), nominal, rtol=1e-14)
 
 
+def test_drawn_robots_move_by_mjx_as_by_their_equations():
+    """Each by edits of its own of the MJCF; 1 % off, they do not."""
+    plant, design = pipeline.problem().plant, pipeline.problem().plant.Design(jnp.asarray(0.7), jnp.asarray(0.4))
+    drawn, at = Drawn.of(plant, BOX, jax.random.key(0), 30), situation(30)
+    own = jnp.stack(drawn.rate(design, at))
+    by_mjx = jnp.stack(drawn._replace(motion=rollout.mjx_rate).rate(design, at))
+    np.testing.assert_allclose(by_mjx, own, rtol=1e-9, atol=1e-9)
+    off = drawn.parameters | {"mass": drawn.parameters["mass"] + 0.5}
+    heavier = drawn._replace(motion=rollout.mjx_rate, parameters=off)
+    assert np.max(np.abs(jnp.stack(heavier.rate(design, at)) - own)) > 1e-2
+
+
 @cache
 def estimator():
     """Funnels of the published RTC-D pendulum by their box."""

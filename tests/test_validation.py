@@ -223,7 +223,7 @@ STATES = 700
 
 
 def _compared(other: rollout.Dynamics, problem=PROBLEM, levels=0.999 * KNOWN):
-    program = jax.jit(partial(compare_physics, _rollouts(problem), states=STATES, mjx=other))
+    program = jax.jit(partial(compare_physics, _rollouts(problem), states=STATES, mjx=lambda plant, drawn: other))
     return jax.device_get(program(jnp.asarray(levels), jax.random.key(3)))
 
 
