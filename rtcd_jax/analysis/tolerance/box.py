@@ -91,4 +91,5 @@ def _singles(
             noise = jnp.zeros_like(whole.noise).at[i].set(whole.noise[i])
             yield f"measured {name}", unit, float(whole.noise[i]), alone(noise=noise), inf
     if whole.age is not None:
-        yield "age", "s", float(whole.age), alone(age=whole.age), inf
+        longest = max(problem.config.trajectory.step.max, float(whole.age))  # of first order: no more than an interval
+        yield "age", "s", float(whole.age), alone(age=whole.age), longest / float(whole.age) if whole.age else inf

@@ -21,7 +21,7 @@ from rtcd_jax.funnel import estimate_funnel
 from rtcd_jax.plants import plant_class
 from rtcd_jax.policy import input_jumps
 from rtcd_jax.problem import Problem, make_problem
-from rtcd_jax.system.console import Clock, Console, Progress, table
+from rtcd_jax.system.console import Clock, Console, Progress, duration, table
 from rtcd_jax.system.files import make_folder, replace, replace_json
 from rtcd_jax.types import Candidate, Policy, Status, Trajectory, Uncertainty
 from rtcd_jax.volume import VOLUMES, funnel_volume
@@ -104,7 +104,7 @@ def _teller(boxes: Sequence[Side], console: Console) -> Callable[[np.ndarray, np
         rounds += 1
         known = int(np.sum(~_open(low, high, most)))
         whole = f"{boxes[-1].name} between {low[-1]:.3g} and {high[-1]:.3g}"
-        text = f"round {rounds}: {known}/{len(boxes)} factors known, {whole}  {clock.times(known, len(boxes))}"
+        text = f"round {rounds}: {known}/{len(boxes)} factors known, {whole}  elapsed {duration(clock.elapsed)}"
         console.progress(Progress(known, len(boxes), text))
 
     return tell

@@ -60,6 +60,7 @@ def test_a_box_has_a_side_for_each_of_its_uncertainties_and_their_sum_is_the_who
         np.testing.assert_allclose(part, all_of_it)
     assert {float(side.box.residual) for side in found} == {0.5}
     assert found[-1].most == pytest.approx(0.999 / 0.2)  # no damping above twice its own
+    assert found[-2].most == pytest.approx(0.1 / 0.005)  # no measurement older than the longest interval
     boxes = stacked(found, np.arange(len(found), dtype=float))
     np.testing.assert_allclose(boxes.input, [0, 0, 0, 0, 4 * 0.05, 0, 0, 7 * 0.05])
 
