@@ -65,9 +65,9 @@ def estimate_funnel(
     boxes = sets.radii_inside(jnp.asarray(problem.state_limits, sets.centers.dtype))
     saturated = _saturating_radius(problem, policy, sets.part(slice(-1, None)))
     boxes = jnp.minimum(boxes, REACH * saturated)
-    last = _goal_level(problem, candidate, policy, sets.part(slice(-1, None)), boxes[-1], keys[0], budget)
+    last = goal_level(problem, candidate, policy, sets.part(slice(-1, None)), boxes[-1], keys[0], budget)
 
-    levels = _scan_knots(rollouts, boxes, last, keys[1], budget)
+    levels = knot_levels(rollouts, boxes, last, keys[1], budget)
     levels, samples = validate_intervals(rollouts, levels, keys[2], budget)
     if budget.samples_per_knot:
         levels, samples = validate_paths(rollouts, levels, keys[3], budget, samples_per_knot)
@@ -84,7 +84,7 @@ def estimate_funnel(
     return Funnel(policy, levels, samples, status, borne)
 
 
-def _scan_knots(rollouts: Rollouts, boxes, last, key, budget: SamplingBudget):
+def knot_levels(rollouts: Rollouts, boxes, last, key, budget: SamplingBudget):
     """Levels [N+1] backward from the `last` one."""
     n, dtype, funnel = rollouts.problem.plant.n, boxes.dtype, budget.funnel
 
@@ -161,7 +161,7 @@ def _saturating_radius(problem, policy, goal_set: Ellipsoids):
     return jnp.min(jnp.asarray(problem.input_limits, largest.dtype) / largest)
 
 
-def _goal_level(problem, candidate, policy, goal_set: Ellipsoids, box, key, budget: SamplingBudget):
+def goal_level(problem, candidate, policy, goal_set: Ellipsoids, box, key, budget: SamplingBudget):
     """rho_N: V decreases over `horizon` from every sampled state below it, inside the boxes.
 
     V then decreases at all multiples of the horizon, so that every state arrives: a Lyapunov function of the map over

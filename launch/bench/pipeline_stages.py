@@ -61,13 +61,13 @@ def stages(config: Config, population: int) -> Iterator[Stage]:
 
     def goal(candidate, policy):
         rollouts, boxes = prepared(candidate, policy)
-        return funnel._goal_level(
+        return funnel.goal_level(
             problem, candidate, policy, rollouts.sets.part(slice(-1, None)), boxes[-1], key, budget
         )
 
     def scan(candidate, policy, last):
         rollouts, boxes = prepared(candidate, policy)
-        return funnel._scan_knots(rollouts, boxes, last, key, budget)
+        return funnel.knot_levels(rollouts, boxes, last, key, budget)
 
     def held_out(candidate, policy, levels):
         return validate_intervals(Rollouts.of(problem, candidate, policy, budget.funnel), levels, key, budget)

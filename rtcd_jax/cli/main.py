@@ -62,6 +62,7 @@ VERBS = {
         "rtcd_jax.cli.search_verbs:optimize",
         "search for the design and the weights with the largest funnel, or resume a search",
     ),
+    "configs": Verb("rtcd_jax.cli.search_verbs:configs", "list the packaged configurations, or print one"),
     "sweep": Verb(
         "rtcd_jax.cli.search_verbs:sweep", "make all the runs that a YAML's sweep section asks for, or one of them"
     ),
@@ -72,6 +73,9 @@ VERBS = {
         jax=True,
         shown=True,
     ),
+    "list": Verb("rtcd_jax.cli.run_verbs:list_", "list the runs in a folder: how far, how large, how sure"),
+    "show": Verb("rtcd_jax.cli.run_verbs:show", "say what a run is, found, proved, verified, and bears"),
+    "diff": Verb("rtcd_jax.cli.run_verbs:diff", "compare two runs: configurations, best candidates, volumes"),
     "report": Verb(
         "rtcd_jax.cli.run_verbs:report", "write a run's figures and its page, or compare several runs on one"
     ),

@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, Literal
 
+import tyro
 from pydantic import AfterValidator, Field
 
 from rtcd_jax.cli.exits import Exit
@@ -62,6 +63,59 @@ def report(options: ReportOptions, console: Console) -> Exit:
 
     page, *figures = write_report(options.runs, options.to, console)
     console.message(f"{page}, and {len(figures)} figures in {figures[0].parent}")
+    return Exit.OK
+
+
+class ListOptions(Options):
+    """List the runs in a folder and below: how far each is, its best volume, guarantee, verification, what it bears.
+
+    Example: rtcd list checkpoints
+    """
+
+    folder: Annotated[Positional[Path], shown("DIR")] = Field(
+        default=Path("checkpoints"), description="where to look, three folders deep"
+    )
+
+
+def list_(options: ListOptions, console: Console) -> Exit:
+    from rtcd_jax.analysis.overview import list_runs
+
+    console.message(list_runs(options.folder, console))
+    return Exit.OK
+
+
+class ShowOptions(Options):
+    """Say what a run is, how far, what it found, what of it is proved and verified, and what uncertainty it bears.
+
+    Example: rtcd show checkpoints/pendulum_rtcd
+    """
+
+    run: Run = Field(description="the run folder")
+
+
+def show(options: ShowOptions, console: Console) -> Exit:
+    from rtcd_jax.analysis.overview import show_run
+
+    for line in show_run(options.run, console):
+        console.message(line)
+    return Exit.OK
+
+
+class DiffOptions(Options):
+    """Compare two runs: the keys in which their configurations differ, their best candidates and volumes.
+
+    Example: rtcd diff checkpoints/pendulum_rtc checkpoints/pendulum_rtcd
+    """
+
+    first: Annotated[Positional[ExistingRun], shown("RUN1")] = Field(description="a run folder")
+    second: Annotated[Positional[ExistingRun], shown("RUN2")] = Field(description="another one")
+
+
+def diff(options: DiffOptions, console: Console) -> Exit:
+    from rtcd_jax.analysis.overview import diff_runs
+
+    for part in diff_runs(options.first, options.second, console):
+        console.message(part)
     return Exit.OK
 
 
@@ -191,7 +245,9 @@ class CertifyOptions(Options):
 
     run: Run = Field(description="the run folder")
     elites: int = Field(default=1, description="how many, the best first [-]", ge=1)
-    rung: Literal["certified", "proved"] = Field(default="proved", description="the guarantee to be shown")
+    guarantee: Annotated[Literal["certified", "proved"], tyro.conf.arg(aliases=("--rung",))] = Field(
+        default="proved", description="to be shown"
+    )
     optimize_value: bool = Field(default=False, description="choose the ellipsoids' shapes too")
     workers: int = Field(default=0, description="processes, one elite each; 0 for one a core [-]", ge=0)
 
@@ -200,7 +256,9 @@ def certify(options: CertifyOptions, console: Console) -> Exit:
     from rtcd_jax.certificate.prove.run import certify_run
 
     workers = options.workers or cores()
-    return _verdict(certify_run(options.run, options.elites, options.rung, workers, console, options.optimize_value))
+    return _verdict(
+        certify_run(options.run, options.elites, options.guarantee, workers, console, options.optimize_value)
+    )
 
 
 def _certificate(path: Path) -> Path:

@@ -11,18 +11,29 @@ from rtcd_jax.cli.config_options import config_branch
 from rtcd_jax.cli.exits import Exit, say
 from rtcd_jax.cli.options import FLAT, OPTIMIZE_USAGE, Cache, Options, Positional, shown
 from rtcd_jax.config.load import EXAMPLE, Config, load, parse, parse_yaml
+from rtcd_jax.config.packaged import config_path, listing, packaged
 from rtcd_jax.config.schema import SMALLEST_POPULATION
 from rtcd_jax.config.settings import Settings, invalid, refusal
-from rtcd_jax.system.console import Console, silent
+from rtcd_jax.system.console import Console, silent, table
 from rtcd_jax.system.devices import prepare_jax
-from rtcd_jax.system.errors import ConfigError, Problem, UserError
+from rtcd_jax.system.errors import ConfigError, Problem, UserError, closest
 
 if TYPE_CHECKING:
     from rtcd_jax.system.cluster import Cluster
 
 RUNS = Path("checkpoints")
 _UNDER_SRUN = "as srun or mpirun say"
-_ConfigPath = Annotated[Positional[Path], shown("CONFIG")]
+
+
+def _named(given: Path) -> Path:
+    try:
+        return config_path(given)
+    except ConfigError as error:
+        raise refusal(error.problems[0].text) from None
+
+
+_ConfigPath = Annotated[Positional[Path], AfterValidator(_named), shown("CONFIG")]
+_EXPERIMENT = "the experiment, a YAML file or the name of a packaged one"
 
 
 class Machines(Settings):
@@ -93,10 +104,11 @@ class OptimizeOptions(Options):
 
     CONFIG comes first. Every key of the YAML is an option; without one, the defaults are those of the paper's pendulum.
 
-    Example: rtcd optimize configs/pendulum_rtcd.yaml --run checkpoints/mine --search.population 512
+    Example: rtcd optimize pendulum_rtcd --run checkpoints/mine --search.population 512
+    Example: rtcd optimize configs/pendulum_rtcd.yaml
     """
 
-    file: _ConfigPath = Field(description="the experiment, a YAML file")
+    file: _ConfigPath = Field(description=_EXPERIMENT)
     config: Annotated[Config, PlainValidator(_configuration), FLAT]
     run: Annotated[Path, shown("FOLDER")] = Field(description="run folder, resumed if it is there")
     machines: Annotated[Machines, FLAT] = Machines()
@@ -105,7 +117,7 @@ class OptimizeOptions(Options):
     def defaults(cls, words: Sequence[str]) -> Mapping[str, Any]:
         """The file's own values, and a run folder of its name."""
         if words and not words[0].startswith("-"):
-            file = Path(words[0])
+            file = config_path(Path(words[0]))
             return {"config": config_branch(load(file)), "run": RUNS / file.stem}
         if words and not {"-h", "--help"} & set(words):
             raise UserError(f"the configuration comes first, but found {words[0]!r}: {OPTIMIZE_USAGE}")
@@ -151,7 +163,7 @@ class SweepOptions(Options):
     Example: rtcd sweep configs/sweep.yaml --list
     """
 
-    file: _ConfigPath = Field(description="a YAML with a sweep section")
+    file: _ConfigPath = Field(description="a YAML with a sweep section, or the name of a packaged one")
     folder: Annotated[Path | None, shown("FOLDER", "checkpoints/NAME")] = Field(
         default=None, description="of the run folders"
     )
@@ -223,7 +235,7 @@ class ScaleOptions(Options):
     Example: rtcd scale configs/pendulum_rtcd.yaml --populations 64,256,1024 --devices 1,2
     """
 
-    file: _ConfigPath = Field(description="the experiment, a YAML file")
+    file: _ConfigPath = Field(description=_EXPERIMENT)
     populations: Annotated[str, _counts(SMALLEST_POPULATION), shown("P,P,…")] = Field(
         default="64,256,1024", description="candidates in a generation [-]"
     )
@@ -244,4 +256,31 @@ def scale(options: ScaleOptions, console: Console) -> Exit:
     grid = counts(options.populations), counts(options.devices)
     folder = options.folder or RUNS / f"scale_{options.file.stem}"
     study(options.file, config, *grid, options.repeats, folder, console)
+    return Exit.OK
+
+
+def _one_of_the_packaged(name: str | None) -> str | None:
+    if name is not None and name not in packaged():
+        raise refusal(f"no packaged configuration; {closest(name, tuple(packaged()))}")
+    return name
+
+
+class ConfigsOptions(Options):
+    """List the packaged configurations, or print one: a file to begin an experiment of your own with.
+
+    `rtcd optimize NAME` runs one as it is.
+
+    Example: rtcd configs pendulum_rtcd > mine.yaml
+    """
+
+    name: Annotated[Positional[str | None], AfterValidator(_one_of_the_packaged), shown("NAME", "list all")] = Field(
+        default=None, description="the one to print"
+    )
+
+
+def configs(options: ConfigsOptions, console: Console) -> Exit:
+    if options.name:
+        console.message(packaged()[options.name].read_text(encoding="utf-8").rstrip())
+    else:
+        console.message(table(("configuration", "what it is"), listing(), left={"configuration", "what it is"}))
     return Exit.OK

@@ -282,6 +282,19 @@ class UncertaintyConfig(Settings):
         widths = (*self.design.values(), *self.plant.values(), *self.noise, self.input_limit, self.input, self.age)
         return not any(widths)
 
+    def in_words(self, plant: PlantConfig) -> str:
+        """The box as every result of the robot states it."""
+        if self.empty:
+            return "one exact model"
+        shares = self.design | self.plant | {"input limit": self.input_limit}
+        parts = [f"{name} ± {share:.3g} of itself" for name, share in shares.items() if share]
+        unit = next(iter(plant.inputs.values()))
+        parts += [f"|w(t)| <= {self.input:g} {unit} on the motors' axes"] if self.input else []
+        measured = zip(plant.states.items(), self.noise, strict=False)
+        parts += [f"{name} measured within {error:g} {unit}" for (name, unit), error in measured if error]
+        parts += [f"measurements up to {self.age:g} s old"] if self.age else []
+        return ", ".join(parts)
+
 
 MOST_STEPS = 100_000
 """Of one rollout about the goal."""

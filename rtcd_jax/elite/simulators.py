@@ -7,6 +7,7 @@ import numpy as np
 
 from rtcd_jax.elite.closed_loop import Dynamics, March, dormand_prince, fastest_rate, fastest_rate_of_goal, runge_kutta
 from rtcd_jax.elite.elite import Elite
+from rtcd_jax.system.errors import UserError
 
 STEPS = 4
 """Fixed steps in an interval, at least."""
@@ -52,9 +53,18 @@ def simulator_of(elite: Elite, name: str, states: int) -> Simulator:
 
 
 def dynamics_of(elite: Elite) -> Dynamics:
-    """The plant's closed form, or C MuJoCo where there is none."""
+    """The plant's closed form, or C MuJoCo where there is none.
+
+    Raises:
+        UserError: the elite's parameters lack one that the closed form needs.
+    """
     if elite.plant in CLOSED_FORMS:
-        return CLOSED_FORMS[elite.plant](elite.parameters)
+        closed_form = CLOSED_FORMS[elite.plant](elite.parameters)
+        try:
+            closed_form(elite.x[:1], elite.u[:1])
+        except KeyError as missing:
+            raise UserError(f"the elite's parameters lack {missing}") from None
+        return closed_form
     from rtcd_jax.plants.mjx import CpuDynamics, model_of
 
     columns = elite.x_goal.size + elite.u_max.size

@@ -116,22 +116,6 @@ def _push(problem: Problem, evaluation: Evaluation) -> dict[str, Any]:
     return {"margin": inside[k, i], "input": name, "time": time, "within_limits": within[k, i]}
 
 
-def what_it_bears(problem: Problem) -> str:
-    """The uncertainty that every funnel of the run bears, in words."""
-    box, plant = problem.config.uncertainty, problem.plant
-    if box.empty:
-        return "one exact model"
-    units = dict(zip(plant.state_names, plant.state_units, strict=True))
-    shares = box.design | box.plant | {"input limit": box.input_limit}
-    parts = [f"{name} ± {share:.3g} of itself" for name, share in shares.items() if share]
-    parts += [f"|w(t)| <= {box.input:g} {plant.input_units[0]} on the motors' axes"] if box.input else []
-    parts += [
-        f"{name} measured within {e:g} {unit}" for (name, unit), e in zip(units.items(), box.noise, strict=False) if e
-    ]
-    parts += [f"measurements up to {box.age:g} s old"] if box.age else []
-    return ", ".join(parts)
-
-
 def epsilon(samples: np.ndarray, confidence: float, statements: int) -> float:
     """Largest failure probability of a state uniform in any knot's ellipsoid, at `confidence` jointly for all knots.
 

@@ -15,7 +15,7 @@ from rtcd_jax.evaluation import device_chunk, make_evaluate
 from rtcd_jax.genome import initial_genome
 from rtcd_jax.problem import Problem, make_problem
 from rtcd_jax.run.folder import RunFolder
-from rtcd_jax.run.format import arrays_of, record_of, what_it_bears
+from rtcd_jax.run.format import arrays_of, record_of
 from rtcd_jax.run.reevaluation import Reevaluation, Reported, physics_line, row
 from rtcd_jax.run.sharding import Sharded, sharded
 from rtcd_jax.search import search
@@ -165,7 +165,7 @@ def summary(problem: Problem, initial: Reported, best: Reported) -> Iterator[str
     yield f"best: a state uniform in any of its ellipsoids fails to arrive with {promise}"
     push, unit = after["push"], f"{problem.plant.input_units[0]} s"
     yield f"best: x*(t) and an impulse of up to {push['margin']:.3g} {unit} at any knot are in its funnel"
-    yield f"all funnels bear: {what_it_bears(problem)}"
+    yield f"all funnels bear: {problem.config.uncertainty.in_words(problem.config.plant)}"
     design = ", ".join(
         f"{name} {after['design'][name]:.4g} {unit}" for name, unit in problem.plant.design_units.items()
     )

@@ -9,7 +9,7 @@ from scipy.integrate import solve_ivp
 
 from rtcd_jax.certificate.falsify import falsify
 from rtcd_jax.certificate.falsify.falsify import TOLERANCE, Part, enough_steps, falsify_file, summed
-from rtcd_jax.certificate.falsify.simulation import Motions
+from rtcd_jax.certificate.falsify.simulation import TOGETHER, Motions
 from rtcd_jax.cli import main as cli
 from tests.certificate import swing
 from tests.certificate.loops import floats
@@ -48,6 +48,24 @@ def test_what_is_wrong_is_falsified(content, claim):
     where = container(wrong)
     where[key] = nudged(where[key], share)
     assert getattr(summed([Part.of(Motions(resealed(wrong)).follow(300, 8, random()))], 8), broken) > 0
+
+
+def test_motions_that_are_lost_are_followed_no_further(content):
+    """From the funnel of a nominal motion that is a thousand times as large: one look at the goal, not a minute."""
+    wide = copy.deepcopy(content)
+    wide["claim"]["x"] = [[(1000 * float.fromhex(value)).hex() for value in row] for row in wide["claim"]["x"]]
+    motions = Motions(resealed(wide))
+    steps_taken = []
+
+    def settling(*arguments):
+        steps_taken.append(arguments)
+        return Motions.advanced(motions, *arguments)
+
+    motions.advanced = settling
+    found = motions.follow(64, 4, random())
+    longest = 4 * motions.dt / 4
+    assert len(steps_taken) <= 4 * len(motions.intervals) * 4 + TOGETHER / longest + 1
+    assert not found.arrived.any()
 
 
 def test_motions_are_those_of_an_outside_integrator(content):

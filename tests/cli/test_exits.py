@@ -14,6 +14,7 @@ from rtcd_jax.cli.exits import STOPPED, Exit
 from rtcd_jax.system.errors import UserError
 from rtcd_jax.system.processes import processes
 from tests.paths import ROOT
+from tests.stopping import stop
 
 SMOKE = str(ROOT / "configs" / "smoke.yaml")
 RTCD = [sys.executable, "-m", "rtcd_jax"]
@@ -101,9 +102,9 @@ def test_the_package_runs_as_a_module(module):
 # ---- interrupts
 
 
-def ends_interrupted(process):
-    """It ends with the code and one line; the limit stands far above the second or two that are promised."""
-    _, errors = process.communicate(timeout=60)
+def ends_interrupted(process, send=os.kill):
+    """It ends in time, with the code and one line."""
+    _, errors = stop(process, signal.SIGINT, send)
     assert (process.returncode, errors) == (Exit.INTERRUPTED, f"{STOPPED}\n")
 
 
@@ -156,7 +157,6 @@ sys.exit(cli.main())
     process = start(sys.executable, "-c", program)
     assert process.stdout.readline() == "begun\n"
     time.sleep(0.2)
-    process.send_signal(signal.SIGINT)
     ends_interrupted(process)
 
 
@@ -166,7 +166,6 @@ def test_an_interrupt_ends_a_search_that_compiles(delay, tmp_path):
     while "compiling" not in process.stdout.readline():
         pass
     time.sleep(delay)
-    process.send_signal(signal.SIGINT)
     ends_interrupted(process)
 
 
@@ -193,8 +192,7 @@ sys.exit(cli.main())
     workers = process.stdout.readline().split()
     assert len(workers) == 2
     time.sleep(1.0)
-    send(process.pid, signal.SIGINT)
-    ends_interrupted(process)
+    ends_interrupted(process, send)
     patience = time.monotonic() + 30
     while any(alive(worker) for worker in workers) and time.monotonic() < patience:
         time.sleep(0.05)

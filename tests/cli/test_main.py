@@ -101,7 +101,7 @@ def test_help_shows_the_file_s_own_values(tmp_path):
 
 
 WRONG = {
-    "misspelt verb": (["optimise"], "unknown command 'optimise'; did you mean 'optimize'? Valid: optimize, sweep"),
+    "misspelt verb": (["optimise"], "unknown command 'optimise'; did you mean 'optimize'? Valid: optimize, configs"),
     "no file": (["optimize", "configs/pendulum_rtcdd.yaml"], "no such file; did you mean 'configs/pendulum_rtcd.yaml'"),
     "no arguments": (["optimize"], "Missing from rtcd optimize: CONFIG"),
     "option first": (["optimize", "--run", "x", RTCD], "the configuration comes first, but found '--run'"),
@@ -153,8 +153,8 @@ def test_all_errors_of_a_file_at_once(tmp_path):
         f"rtcd: {path}: 3 errors",
         "  trajectory.knots = 'many': must be a whole number; knots N+1 of the nominal motion [-] (paper, section III)",
         "  funnel.confidence = 1.0: must be > 0 and < 1; 1 - beta, jointly over the knots [-]",
-        "  search.sed = 0: unknown key; did you mean 'seed'? Valid: objective, mode, population, generations, sigma, "
-        "seed, chunk, nested",
+        "  search.sed = 0: unknown key; did you mean 'seed'? Valid: objective, at_least, mode, population, "
+        "generations, sigma, seed, chunk, nested",
     ]
 
 

@@ -17,6 +17,9 @@ from tests.run.small import GENERATIONS, SMALL
 READERS = {
     "verify": (["--states", "20", "--seed", "3", "--workers", "1"], True),
     "report": ([], False),
+    "list": ([], False),
+    "show": ([], False),
+    "diff": (["run"], False),
     "replay": (["inside.csv"], False),
     "certify": (["--workers", "1"], True),
     "disturb": (["--states", "2", "--seed", "3"], None),
@@ -81,6 +84,12 @@ def test_results_reach_the_page_that_is_there(sent):
     assert "report.html shows this, too" in sent["certify"][1]
     assert "report.html shows this, too" in sent["tolerance"][1]
     assert "report.html" not in sent["verify"][1]
+
+
+def test_the_packaged_configurations(folder):
+    code, screen = in_terminal("configs", folder=folder)
+    ends_well(code, screen, draws=False)
+    assert "pendulum_rtcd" in screen
 
 
 def test_a_certificate_is_checked_and_falsified(sent, folder):
@@ -175,9 +184,9 @@ def test_a_page_that_cannot_be_brought_up_to_date_ends_nothing(finished, tmp_pat
 # ---- what others have written
 
 
-@pytest.mark.parametrize("arguments", [["--\x1b[31mred"], ["--states", "\x1b]0;title\x07"], ["--rung", "\x9b2J"]])
+@pytest.mark.parametrize("arguments", [["--\x1b[31mred"], ["--states", "\x1b]0;title\x07"], ["--guarantee", "\x9b2J"]])
 def test_a_terminal_shows_words_that_are_refused_and_does_not_obey_them(arguments, folder):
-    verb = "certify" if "--rung" in arguments else "verify"
+    verb = "certify" if "--guarantee" in arguments else "verify"
     code, screen = in_terminal(verb, "run", *arguments, folder=folder)
     assert code == Exit.WRONG_INPUT
     assert re.search(r"\\x1b\[31mred|\\x1b\]0;title\\+x07|\\x9b2J", screen)

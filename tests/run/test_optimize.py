@@ -28,6 +28,7 @@ from tests.consoles import Screen
 from tests.paths import ROOT
 from tests.run.small import GENERATIONS, SMALL, Small
 from tests.search.fake_evaluation import bowl, population
+from tests.stopping import stop
 
 
 @pytest.fixture(scope="module")
@@ -154,15 +155,14 @@ LONG = "--elites.trials", "100000000", "--search.generations", "1"
 
 @pytest.mark.parametrize(("sent", "code"), [(signal.SIGTERM, Exit.PREEMPTED), (signal.SIGINT, Exit.INTERRUPTED)])
 def test_asked_to_stop_while_its_elites_are_sampled_again_a_run_ends_and_goes_on(small, tmp_path, sent, code):
-    """While their program compiles or is at work; at once, far within the limit. Both ask a start and its resume."""
+    """While their program compiles or is at work. Both ask a start and its resume."""
     for first in ("compiling", "going on after generation 1"):
         process = small.start("optimize", small.config, "--run", tmp_path / "run", *LONG)
         output = iter(process.stdout.readline, "")
         assert any(first in line for line in output)
         assert first != "compiling" or any(line.startswith("generation 1/1") for line in output)
         time.sleep(3)
-        process.send_signal(sent)
-        told, errors = process.communicate(timeout=30)
+        told, errors = stop(process, sent)
         assert process.returncode == code, told + errors
         assert (f"saved in {tmp_path / 'run'}" if sent == signal.SIGTERM else STOPPED) in told + errors
     assert not (tmp_path / "run" / "elites").exists()
@@ -174,8 +174,7 @@ def test_asked_to_stop_while_it_compiles_a_run_ends_and_leaves_a_folder_that_goe
     process = subprocess.Popen(command, cwd=ROOT, env=environment, stdout=subprocess.PIPE, text=True)
     assert any(line.startswith("compiling") for line in iter(process.stdout.readline, ""))
     time.sleep(2)
-    process.send_signal(signal.SIGTERM)
-    output, _ = process.communicate(timeout=30)
+    output, _ = stop(process, signal.SIGTERM)
     assert process.returncode == Exit.PREEMPTED, output
     assert "generation" not in output
     code, output, errors = small.optimize(tmp_path / "run")

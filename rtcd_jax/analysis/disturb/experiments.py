@@ -100,7 +100,7 @@ def off_nominal(comparison: Comparison, states: int, seed: int, simulate: Simula
     outcome = simulate(undisturbed(comparison.plant, comparison.design, loop, x.T), "off-nominal", True)
     arrived = _arrived(outcome).reshape(len(places), loops, states)
     return {
-        "experiment": "uniform states of the first ellipsoids (sampled rung), and of ellipsoids enlarged by a factor",
+        "experiment": "uniform states of the first ellipsoids (sampled), and of ellipsoids enlarged by a factor",
         "states": states,
         "seed": seed,
         "confidence": CONFIDENCE,

@@ -2,8 +2,8 @@
 
 reading.py, history.py     the folder's content, and the course of its search
 charts.py                  what a figure shows: panels of curves, bands and shares
-funnels.py, progress.py    the figures of funnels and of a search
-canvas.py                  charts in print, figures/NAME.png and .pdf
+funnels.py, motion.py, progress.py  the figures of funnels, of the swing-up over time, and of a search
+canvas.py                  charts in print, figures/NAME.png, .pdf and .csv
 traces.py, plots.py        charts and funnels on the page, by plotly.js
 tables.py, page.py         the page's tables, report.html
 """

@@ -5,7 +5,7 @@ canvas.py prints a chart by matplotlib, traces.py hands it to plotly.js, `table`
 
 import csv
 import io
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal, final
 
@@ -36,13 +36,14 @@ class Curve:
 @final
 @dataclass(frozen=True, eq=False)
 class Band:
-    """The area between two curves."""
+    """The area between two curves; its `group` is as a curve's."""
 
     x: Float[np.ndarray, " T"]
     low: Float[np.ndarray, " T"]
     high: Float[np.ndarray, " T"]
     label: str
     color: str
+    group: str = ""
 
 
 @final
@@ -90,17 +91,29 @@ class Chart:
 
 
 def table(chart: Chart) -> str:
-    """The chart's curves as CSV, one point a line: panel, curve, and both coordinates."""
+    """What the chart draws as CSV, one point a line: panel, curve, and both coordinates; an area is its two edges."""
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(["panel", "curve", chart.x, "value"])
     for panel in chart.panels:
         label = (panel.label or panel.title).replace("\n", " ")
         for mark in panel.marks:
-            if isinstance(mark, Curve):
-                points = zip(mark.x.tolist(), mark.y.tolist(), strict=True)
-                writer.writerows([label, mark.label, repr(x), repr(y)] for x, y in points)
+            for name, x, y in _curves(mark):
+                points = zip(x.tolist(), y.tolist(), strict=True)
+                writer.writerows([label, name, repr(x), repr(y)] for x, y in points)
     return text.getvalue()
+
+
+def _curves(mark: Curve | Band | Shares) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
+    match mark:
+        case Curve():
+            yield mark.label, mark.x, mark.y
+        case Band():
+            for edge, y in (("from", mark.low), ("to", mark.high)):
+                yield f"{mark.label or mark.group}, {edge}", mark.x, y
+        case Shares():
+            for name, (values, _) in mark.parts.items():
+                yield name, mark.x, values
 
 
 def more_than_a_decade(*values: Float[np.ndarray, " T"]) -> bool:

@@ -16,12 +16,13 @@ from rtcd_jax.analysis.report import tables
 from rtcd_jax.analysis.report.canvas import print_chart
 from rtcd_jax.analysis.report.charts import Chart, table
 from rtcd_jax.analysis.report.funnels import draw_funnels, draw_over, levels
+from rtcd_jax.analysis.report.motion import charts_of_motion
 from rtcd_jax.analysis.report.plots import planes_of
 from rtcd_jax.analysis.report.progress import charts
 from rtcd_jax.analysis.report.reading import Experiment, Run, Tolerance, compared, funnel_views, read_run
 from rtcd_jax.analysis.report.tables import Cell, Table
 from rtcd_jax.analysis.report.traces import plots_of
-from rtcd_jax.analysis.report.words import NONE, duration, guarantee, listed, ratio, volume_unit, words
+from rtcd_jax.analysis.report.words import NONE, duration, guarantee, ratio, volume_unit, words
 from rtcd_jax.system.console import Console
 from rtcd_jax.system.errors import UserError
 from rtcd_jax.system.files import replace
@@ -78,7 +79,9 @@ def draw_figures(run: Run) -> list[Path]:
     Raises UserError if they cannot be written.
     """
     funnels = draw_over([run], run.figures, "overlay") + draw_funnels(run)
-    others = {"levels": levels(run.config, run.funnels, guarantee(run.best.record)), **charts([run])}
+    note = guarantee(run.best.record)
+    others = {"levels": levels(run.config, run.funnels, note), **charts_of_motion(run.config, run.funnels)}
+    others |= charts([run])
     drawn = [path for name, chart in others.items() for path in print_chart(chart, run.figures, name)]
     for name, chart in others.items():
         replace(run.figures / f"{name}.csv", table(chart).encode())
@@ -88,13 +91,14 @@ def draw_figures(run: Run) -> list[Path]:
 def render(runs: Sequence[Run]) -> str:
     """The whole page."""
     title = html.escape(" and ".join(run.name for run in runs))
-    views, of_search = funnel_views(runs), charts(runs)
+    views = funnel_views(runs)
+    of_motion, of_search = charts_of_motion(runs[0].config, views), charts(runs)
     funnels = planes_of(runs[0].config, views) | plots_of("levels", levels(runs[0].config, views))
     figures = dict(funnels)
-    for name, chart in of_search.items():
+    for name, chart in {**of_motion, **of_search}.items():
         figures |= plots_of(name, chart)
     data = json.dumps(figures, allow_nan=False, separators=(",", ":")).replace("<", "\\u003c")
-    body = "\n".join([_header(runs), *_sections(runs, list(funnels), of_search)])
+    body = "\n".join([_header(runs), *_sections(runs, list(funnels), of_motion, of_search)])
     return (
         f'<!doctype html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n<title>{title}</title>\n'
         f'<meta name="viewport" content="width=device-width, initial-scale=1">\n'
@@ -130,11 +134,7 @@ def _header(runs: Sequence[Run]) -> str:
 
 
 def _candidate(run: Run) -> str:
-    record = run.best.record
-    design = [listed(name, value, run.config.plant.design[name]) for name, value in record["design"].items()]
-    weights = [listed(name, value) for name, value in record["weights"].items()]
-    options = [listed(name, record["policy"][name]) for name in run.config.policy.variables()]
-    return html.escape("best: " + ", ".join([*design, *weights, *options]))
+    return html.escape(f"best: {tables.candidate(run)}")
 
 
 def _headlines(run: Run) -> Iterator[tuple[str, str, str]]:
@@ -164,11 +164,15 @@ def _card(name: str, value: str, remark: str) -> str:
     return f'<div class="card">{"".join(f"<{tag}>{html.escape(text)}</{tag}>" for tag, text in parts)}</div>'
 
 
-def _sections(runs: Sequence[Run], funnels: Sequence[str], of_search: Mapping[str, Chart]) -> Iterator[str]:
+def _sections(
+    runs: Sequence[Run], funnels: Sequence[str], of_motion: Mapping[str, Chart], of_search: Mapping[str, Chart]
+) -> Iterator[str]:
     alone = runs[0] if len(runs) == 1 else None
     if alone is None:
         yield _section("Compared", _table(tables.comparison(runs)))
     yield _section("Funnels", *_funnels(runs, funnels))
+    for name, chart in of_motion.items():
+        yield _section(chart.title, *_charted(name, chart))
     promise = "" if alone is None else _note(f"The best funnel is {guarantee(alone.best.record)}.")
     advice = (
         "Ratios are optimal over initial. The sum counts knots, most of them near the goal: look at the initial "
@@ -195,7 +199,7 @@ def _sections(runs: Sequence[Run], funnels: Sequence[str], of_search: Mapping[st
 def _charted(name: str, chart: Chart) -> Iterator[str]:
     """The places of a chart's plots, and its note."""
     if chart.columns == 1:
-        yield _plot(name, "tall" if len(chart.panels) > 2 else "")
+        yield _plot(name, ("", "tall", "taller")[min(len(chart.panels) // 3, 2)])
     else:
         yield f'<div class="grid">{"".join(_plot(each, "small") for each in plots_of(name, chart))}</div>'
     if chart.note:

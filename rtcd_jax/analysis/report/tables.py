@@ -7,7 +7,7 @@ from typing import Any, cast, final
 
 from rtcd_jax.analysis.report.history import OPTIONS
 from rtcd_jax.analysis.report.reading import Experiment, Run, Tolerance
-from rtcd_jax.analysis.report.words import duration, ratio, volume_unit, words
+from rtcd_jax.analysis.report.words import duration, listed, ratio, volume_unit, words
 from rtcd_jax.volume import VOLUMES
 
 Cell = str | float | int | None
@@ -158,6 +158,15 @@ def provenance(runs: Sequence[Run]) -> Table:
     """Which program made the runs, where and when."""
     heads = (*_run_head(runs), "", "")
     return Table(heads, tuple((*_run_cell(runs, run), *row) for run in runs for row in _origin(run)))
+
+
+def candidate(run: Run) -> str:
+    """The best candidate's design, weights and searched options."""
+    record = run.best.record
+    design = [listed(name, value, run.config.plant.design[name]) for name, value in record["design"].items()]
+    weights = [listed(name, value) for name, value in record["weights"].items()]
+    options = [listed(name, record["policy"][name]) for name in run.config.policy.variables()]
+    return ", ".join([*design, *weights, *options])
 
 
 def wall_time(run: Run) -> str | None:

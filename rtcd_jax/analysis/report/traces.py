@@ -38,7 +38,7 @@ def plot(chart: Chart) -> Plot:
         suffix, bottom = "" if number == 1 else str(number), top - room * panel.height / total
         for trace in (trace for mark in panel.marks for trace in _traces(mark, panel)):
             shown = trace.pop("shown", True) and trace["legendgroup"] not in groups
-            groups.add(trace["legendgroup"])
+            groups |= {trace["legendgroup"]} if shown else set()
             data.append(trace | {"yaxis": f"y{suffix}", "showlegend": shown})
         domain = [round(max(bottom, 0.0), 4), round(top, 4)]
         layout[f"yaxis{suffix}"] = {
@@ -73,8 +73,9 @@ def _traces(mark: Curve | Band | Shares, panel: Panel) -> Iterator[Plot]:
             yield {"x": numbers(mark.x), "y": numbers(mark.y), "shown": bool(mark.label)} | name | look | marker
         case Band():
             edge = {"x": numbers(mark.x), "mode": "lines", "line": {"width": 0, "color": mark.color}}
-            edge |= {"hoverinfo": "skip", "legendgroup": mark.label, "name": mark.label}
-            yield edge | {"y": numbers(mark.low), "legendgroup": f"{mark.label}, low", "shown": False}
+            group = mark.group or mark.label
+            edge |= {"hoverinfo": "skip", "legendgroup": group, "name": mark.label or group, "shown": bool(mark.label)}
+            yield edge | {"y": numbers(mark.low), "shown": False}
             yield edge | {"y": numbers(mark.high), "fill": "tonexty", "fillcolor": faint(mark.color, 0.15)}
         case Shares():
             for label, (values, color) in mark.parts.items():

@@ -146,13 +146,14 @@ def volumes_of(
         powers = {e[0]: c for e, c in terms_of(cofactors(data.axes)[1])}
         integral += sum((c / (k + 1) for k, c in powers.items() if k % 2 == 0), Q(0)) * data.duration
     volumes = {
-        "sum": _sum(knots), "integral": ball * rounded(integral), "inlet": volume(intervals[0].first),
+        "sum": total(knots), "integral": ball * rounded(integral), "inlet": volume(intervals[0].first),
         "outlet": knots[-1], "goal": volume(l_goal),
     }  # fmt: skip
     return volumes, {"inlet": widths(intervals[0].first), "outlet": widths(intervals[-1].last), "goal": widths(l_goal)}
 
 
-def _sum(values: Sequence[float]) -> float:
+def total(values: Sequence[float]) -> float:
+    """The sum, correctly rounded; infinite where no double holds it."""
     try:
         return math.fsum(values)
     except OverflowError:

@@ -102,18 +102,21 @@ def falsify_file(path: Path, rollouts: int, seed: int, workers: int, console: Co
 def enough_steps(motions: Motions, seed: int) -> int:
     """Steps an interval with which halved steps change a few hundred motions' |y| by `TOLERANCE` at most.
 
+    It is relative to the largest |y| where that is beyond 1: the motions that went so far refute the certificate.
+
     Raises:
         UserError: with the most steps, too, the states are no numbers any more.
     """
     steps = FEWEST
     while True:
         pilot = motions.follow(PILOT, steps, np.random.default_rng(seed))
-        if pilot.error <= TOLERANCE:
+        if pilot.error <= TOLERANCE * max(1.0, pilot.level.max()):
             return steps
+        finite = np.isfinite([pilot.error, *pilot.level, *pilot.growth]).all()
         if steps == MOST:
             break
-        steps *= 2
-    if not np.isfinite([pilot.error, *pilot.level, *pilot.growth]).all():
+        steps = 2 * steps if finite else MOST
+    if not finite:
         raise UserError(
             f"the motions of this certificate cannot be simulated: with {steps} steps an interval they leave the range "
             "of doubles; `rtcd check` says whether it proves anything"

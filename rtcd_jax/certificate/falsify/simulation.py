@@ -27,6 +27,8 @@ ARRIVED = 0.1
 """|y| in the goal region at which a motion is followed no further: the proof holds all the way down."""
 LONGEST = 60.0
 """Time [s] after which a motion has not arrived."""
+LOST = 1e3
+"""|y| in the goal region from which on a motion is followed no further: it has not arrived. The region ends at 1."""
 COARSER = 4
 """Steps in the goal region are so many times longer: there |y| falls fast, and its growth alone is judged."""
 TOGETHER = 0.2
@@ -150,21 +152,22 @@ class Motions:
         arrived, growth = np.zeros(count, bool), np.zeros(count)
         moving = np.arange(count)
         for _ in range(round(LONGEST / TOGETHER)):
-            x, level = flight.x[:, moving], self._goal_level(flight.x[:, moving])
+            x, level = flight.x[:, moving], self.goal_level(flight.x[:, moving])
             for i in range(round(TOGETHER / step)):
                 x = self.advanced(self._holding, i * step, step, x, 1)
-                now = self._goal_level(x)
+                now = self.goal_level(x)
                 growth[moving] = np.maximum(growth[moving], now - level)
                 level = now
                 flight.measure_limits(x, moving)
             flight.x[:, moving] = x
             arrived[moving[level <= ARRIVED]] = True
-            moving = moving[level > ARRIVED]
+            moving = moving[(level > ARRIVED) & (level < LOST)]
             if not moving.size:
                 break
         return arrived, growth
 
-    def _goal_level(self, x: np.ndarray) -> np.ndarray:
+    def goal_level(self, x: np.ndarray) -> np.ndarray:
+        """|y| [M] of states in the goal region's coordinates."""
         return np.linalg.norm(self._outward @ (x - self._goal[:, None]), axis=0)
 
     def nominal(self, k: int, t: float) -> np.ndarray:

@@ -23,6 +23,13 @@ weights:
 SEARCHED_POLICY = {
     "authority": {"initial": 0.05, "min": 0.01, "max": 1.0}, "discount": {"initial": 0.5, "min": 0.0, "max": 2.0}
 }  # fmt: skip
+PARAMETERS = {
+    "pendulum": {"m": 0.7, "l": 0.4, "b": 0.1, "g": 9.81, "torque_limit": 2.5},
+    "cartpole": {
+        "Mc": 1.07, "Mp": 0.2, "lp": 0.2, "inertia_about_com": 0.0027, "Beq": 5.4, "Bp": 0.0024, "g": 9.81,
+        "force_limit": 6.0,
+    },
+}  # fmt: skip
 YAMLS = {"pendulum": configuration.EXAMPLE, "cartpole": CARTPOLE}
 PROVED = Certificate(
     "proved", "proved", "", start=0.0, intervals=6, seconds=7.25,
@@ -75,7 +82,7 @@ def candidate(config, seed=0, scale=1.0, **changes):
     }
     record = {
         "plant": config.plant.name,
-        "parameters": {},
+        "parameters": PARAMETERS[config.plant.name],
         "state_limits": [limit if np.isfinite(limit) else None for limit in config.task.state_limits],
         "status": "OK",
         "design": {name: variable.initial for name, variable in config.design.items()},

@@ -44,8 +44,9 @@ def chromium(tmp_path_factory):
         yield found
 
 
-FIGURES = {"pendulum": 3 + 5, "cartpole": 4 + 5, "both": 3}
-"""A plane for each coordinate, levels and convergence; a course for each free variable where a run stands alone."""
+FIGURES = {"pendulum": 3 + 3 + 5, "cartpole": 4 + 5 + 5, "both": 3 + 3}
+"""A plane for each coordinate, levels and convergence; the motion and each gain; where a run stands alone, a course for
+each free variable."""
 
 
 @pytest.mark.parametrize("name", FIGURES)
@@ -199,7 +200,7 @@ def test_one_run_gets_its_page_and_figures_several_get_one_beside_them(tmp_path,
     assert page == first / "report.html"
     assert {path.relative_to(first) for path in drawn} == {
         first.relative_to(first) / "figures" / f"{name}.{kind}"
-        for name in ("overlay", "funnel", "levels", "courses", "convergence")
+        for name in ("overlay", "funnel", "levels", "motion", "gains", "courses", "convergence")
         for kind in ("png", "pdf")
     }
     before = sorted(first.rglob("*"))
