@@ -100,7 +100,11 @@ def show_run(path: Path, console: Console) -> Iterator[str]:
     if run.absence:
         yield run.absence
     volumes = gains([run])
-    yield table(volumes.heads, ([_cell(cell) for cell in row] for row in volumes.rows), left={"volume", "unit", "time", "guarantee"})
+    yield table(
+        volumes.heads,
+        ([_cell(cell) for cell in row] for row in volumes.rows),
+        left={"volume", "unit", "time", "guarantee"},
+    )
     yield f"guarantee: {guarantee(run.best.record)}"
     certificate = run.certificates.get("000")
     if certificate is None:
