@@ -13,7 +13,7 @@ from pydantic import AfterValidator, Field
 from rtcd_jax.cli.exits import Exit
 from rtcd_jax.cli.options import Cache, Elite, ExistingRun, Options, Positional, Run, shown
 from rtcd_jax.config.settings import refusal
-from rtcd_jax.system.console import Console
+from rtcd_jax.system.console import Console, silent
 from rtcd_jax.system.devices import cores
 from rtcd_jax.system.errors import Problem
 
@@ -47,11 +47,17 @@ def verify(options: VerifyOptions, console: Console) -> Exit:
 class ReportOptions(Options):
     """Write a finished run's page, report.html, and its figures; several runs are compared on one page.
 
+    --table prints the paper's Table I of the runs and writes nothing; runs that differ in their seed alone share a row.
+
     Example: rtcd report checkpoints/pendulum_rtc checkpoints/pendulum_rtcd --to comparison.html
+    Example: rtcd report checkpoints/pendulum_rtc checkpoints/pendulum_rtcd --table latex
     """
 
     runs: Annotated[Positional[tuple[ExistingRun, ...]], shown("RUN [RUN …]")] = Field(description="the run folders")
     to: Annotated[Path | None, shown("FILE", "in or beside the run")] = Field(default=None, description="the page")
+    table: Annotated[Literal["latex", "csv", "md"] | None, shown("{latex,csv,md}", "the page")] = Field(
+        default=None, description="print a table in this form instead"
+    )
 
     def problems(self) -> Iterator[Problem]:
         if not self.runs:
@@ -59,6 +65,12 @@ class ReportOptions(Options):
 
 
 def report(options: ReportOptions, console: Console) -> Exit:
+    if options.table:
+        from rtcd_jax.analysis.report.publication import table_of
+        from rtcd_jax.analysis.report.reading import read_run
+
+        console.message(table_of([read_run(run, silent()) for run in options.runs], options.table))
+        return Exit.OK
     from rtcd_jax.analysis.report import report as write_report
 
     page, *figures = write_report(options.runs, options.to, console)
