@@ -6,7 +6,7 @@ RECENT := import sys; sys.exit(sys.version_info < (3, 11))
 PYTHON ?= $(shell for python in python3 python3.14 python3.13 python3.12 python3.11; do \
 	$$python -c '$(RECENT)' 2>/dev/null && { echo $$python; break; }; done)
 
-.PHONY: run test lint gpu-budget clean
+.PHONY: run test lint docs gpu-budget clean
 
 run: $(VENV)/installed
 	$(BIN)/rtcd optimize configs/pendulum_rtcd.yaml
@@ -22,6 +22,11 @@ lint: $(VENV)/installed-dev
 	$(BIN)/ruff check
 	$(BIN)/ruff format --check
 	$(BIN)/pyright
+
+# The site of docs/ and of the docstrings, in build/docs; a link that leads nowhere ends it.
+docs: $(BIN)/python
+	$(call install,'.[docs]')
+	$(BIN)/mkdocs build --strict
 
 # What a GPU would have to launch, compiled and counted without one: 224 MB of wheels, some minutes.
 gpu-budget: $(VENV)/installed-dev
