@@ -13,7 +13,7 @@ import yaml
 from rtcd_jax import rollout
 from rtcd_jax.config import load as configuration
 from rtcd_jax.evaluation import elite_budget, make_evaluate, search_budget
-from rtcd_jax.funnel import MARGIN, _crossings, _scan_knots, estimate_funnel
+from rtcd_jax.funnel import MARGIN, _crossings, estimate_funnel, knot_levels
 from rtcd_jax.numerics.ellipsoid import half_widths
 from rtcd_jax.problem import make_problem
 from rtcd_jax.types import Status
@@ -117,7 +117,7 @@ def _scanned(policy, last: float, directions: int):
     def scan(policy):
         rollouts = Rollouts.of(problem, linear.candidate(), policy, problem.config.funnel)
         boxes = rollouts.sets.radii_inside(jnp.asarray(problem.state_limits))
-        return _scan_knots(rollouts, boxes, jnp.asarray(last), jax.random.key(0), _budget(problem))
+        return knot_levels(rollouts, boxes, jnp.asarray(last), jax.random.key(0), _budget(problem))
 
     return np.asarray(scan(policy))
 
