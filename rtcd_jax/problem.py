@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from rtcd_jax.config.load import Config
-from rtcd_jax.plants import plant_class
+from rtcd_jax.plants import make_plant
 from rtcd_jax.plants.base import Plant
 from rtcd_jax.system.devices import require_float64
 from rtcd_jax.system.errors import ConfigError
@@ -20,6 +20,8 @@ AT_REST = 1e-6
 """Largest rate of a goal [state/s]: one typed with 16 digits leaves the rounding of pi times the stiffness."""
 NEAR = 0.15
 """From a quarter turn [rad]: what was meant by 3, 3.1 or 3.14."""
+UNREACHED = 1e-9
+"""Least share of the pencil's largest singular value with which an input reaches a mode."""
 DESIGNS, STATES, LARGEST_STATE = 3, 8, 10.0
 """Where the MJCF is compared with the equations: random designs, states of each, within this or the task's limits."""
 
@@ -77,12 +79,11 @@ def make_problem(config: Config) -> Problem:
 
     Raises:
         UserError: if JAX computes in float32.
-        ConfigError: if the goal is no equilibrium of the initial design without input.
+        ConfigError: if the goal is no equilibrium of the initial design without input, or cannot be stabilized there.
         UserError: if the robot's MJCF does not move as its equations say, at random states, inputs and designs.
     """
     require_float64()
-    constants = config.plant.model_dump(exclude={"name"})
-    plant = plant_class(config.plant.name)(**constants)
+    plant = make_plant(config.plant, config.design_units)
     problem = Problem(
         config=config,
         plant=plant,
@@ -94,8 +95,37 @@ def make_problem(config: Config) -> Problem:
         uncertainty=_uncertainty(config),
     )
     _require_equilibrium(problem)
+    _require_stabilizable(problem)
     _require_agreement(problem)
     return problem
+
+
+def initial_design(problem: Problem) -> eqx.Module:
+    """The design that the configuration begins with."""
+    return _design(problem, 0.0)
+
+
+def linearized_goal(problem: Problem) -> tuple[Float[np.ndarray, "n n"], Float[np.ndarray, "n m"]]:
+    """A and B of the initial design at the goal."""
+    rest = jnp.zeros(problem.plant.m)
+    jacobians = jax.jit(jax.jacfwd(problem.plant.dynamics, (1, 2)))(
+        initial_design(problem), jnp.asarray(problem.goal), rest
+    )
+    a, b = map(np.asarray, jacobians)
+    return a, b
+
+
+def unreached_mode(a: Float[np.ndarray, "n n"], b: Float[np.ndarray, "n m"]) -> tuple[complex, int] | None:
+    """The fastest mode that grows and that no input reaches (Popov, Belevitch, Hautus): its rate [1/s] and the state
+    that moves most in it; None if the system can be stabilized.
+    """
+    found = []
+    for rate in np.linalg.eigvals(a):
+        pencil = np.concatenate([a - rate * np.eye(len(a)), b], axis=1)
+        left, sizes, _ = np.linalg.svd(pencil)
+        if rate.real >= -UNREACHED and sizes[-1] <= UNREACHED * sizes[0]:
+            found.append((complex(rate), int(np.argmax(np.abs(left[:, -1])))))
+    return max(found, key=lambda mode: mode[0].real, default=None)
 
 
 def _variables(config: Config):
@@ -125,7 +155,7 @@ def _uncertainty(config: Config) -> Uncertainty | None:
 
 
 def _require_equilibrium(problem: Problem) -> None:
-    plant, initial = problem.plant, _design(problem, 0.0)
+    plant, initial = problem.plant, initial_design(problem)
     dynamics = jax.jit(plant.dynamics)
 
     def rates(state: np.ndarray) -> np.ndarray:
@@ -151,6 +181,18 @@ def _require_equilibrium(problem: Problem) -> None:
         f"is no equilibrium without input: there the state's derivative is {found.tolist()} and would have to be zero"
     )
     raise ConfigError([Fault(("task", "goal"), text + hint, problem.goal.tolist())])
+
+
+def _require_stabilizable(problem: Problem) -> None:
+    mode = unreached_mode(*linearized_goal(problem))
+    if mode is None:
+        return
+    rate, state = mode
+    text = (
+        f"cannot be held: no input reaches the mode with the rate {rate.real:.3g} 1/s, in which "
+        f"{problem.plant.state_names[state]} moves most"
+    )
+    raise ConfigError([Fault(("task", "goal"), text, problem.goal.tolist())])
 
 
 def _quarter_turns(count: int) -> str:

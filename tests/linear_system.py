@@ -4,7 +4,6 @@ Away from the input's limit the error from a nominal motion obeys e' = (A - B K)
 V = e' S e with its value matrix; both are the same along every motion.
 """
 
-from pathlib import Path
 from typing import ClassVar, final
 
 import equinox as eqx
@@ -42,11 +41,14 @@ class Equations(Plant):
     input_units: ClassVar = ("N",)
     design_units: ClassVar = {}
     Design: ClassVar = Nothing
-    mjcf: ClassVar = Path("none")
+    xml: ClassVar = ""
 
     @property
     def input_limit(self):
         return (self.limit,)
+
+    def motor_speeds(self, design, x):
+        return x[1:2]
 
     def parameters(self, design):
         return {"limit": self.limit}
@@ -70,9 +72,6 @@ class Unstable(Equations):
 
     def dynamics(self, design, x, u):
         return jnp.stack([x[1], 4 * x[0] + u[0]])
-
-    def energy(self, design, x):
-        return 0.5 * x[1] ** 2 - 2 * x[0] ** 2
 
 
 def problem_of(state_limits, limit=UNBOUNDED, intervals=10, **funnel) -> Problem:

@@ -46,9 +46,6 @@ class Scalar(Equations):
     def dynamics(self, design, x, u):
         return jnp.stack([-x[0] + self.cubic * x[0] ** 3 + u[0]])
 
-    def energy(self, design, x):
-        return 0.5 * x[0] ** 2
-
 
 def scalar_funnel(cubic: float, limit: float, may: Uncertainty):
     """That of the uncontrolled system at rest, within |x| <= limit."""

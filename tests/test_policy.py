@@ -12,12 +12,12 @@ from scipy.integrate import solve_ivp
 from scipy.interpolate import CubicHermiteSpline
 
 from rtcd_jax.config.load import load
-from rtcd_jax.plants.pendulum import Pendulum, PendulumDesign
 from rtcd_jax.policy import goal_value, linearize, nominal, options, stabilize
 from rtcd_jax.problem import make_problem
 from rtcd_jax.trajectory import plan
 from rtcd_jax.types import Candidate, Status
 from tests.paths import CONFIGS
+from tests.plants.robots import packaged
 
 CONFIG = CONFIGS / "pendulum_rtcd.yaml"
 
@@ -39,7 +39,9 @@ def problem():
 
 @pytest.fixture(scope="module")
 def candidates():
-    return Candidate(PendulumDesign(jnp.asarray(MASS), jnp.asarray(LENGTH)), jnp.asarray(Q), jnp.asarray(R))
+    return Candidate(
+        packaged("pendulum").Design(jnp.asarray(MASS), jnp.asarray(LENGTH)), jnp.asarray(Q), jnp.asarray(R)
+    )
 
 
 @pytest.fixture(scope="module")
@@ -184,7 +186,7 @@ def test_a_broken_candidate_leaves_the_others_bit_equal(track, candidates, plann
         np.testing.assert_array_equal(beside.gains[row], policies.gains[row])
 
 
-class Unactuated(Pendulum):
+class Unactuated(type(packaged("pendulum"))):
     """The pendulum with a motor that is not connected: its upright rest cannot be stabilized."""
 
     def dynamics(self, design, x, u):
@@ -192,7 +194,7 @@ class Unactuated(Pendulum):
 
 
 def test_what_cannot_be_stabilized_is_indefinite(problem, candidates, planned):
-    loose = dataclasses.replace(problem, plant=Unactuated())
+    loose = dataclasses.replace(problem, plant=Unactuated(*jax.tree.leaves(problem.plant)))
     policy = jax.jit(partial(stabilize, loose))(take(candidates, 0), take(planned, 0))
     assert policy.status == Status.RICCATI_INDEFINITE
 

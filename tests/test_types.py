@@ -11,9 +11,9 @@ from jaxtyping import TypeCheckError
 
 from rtcd_jax.config import load as configuration
 from rtcd_jax.genome import decode
-from rtcd_jax.plants.pendulum import Pendulum, PendulumDesign
 from rtcd_jax.problem import make_problem
 from rtcd_jax.types import Policy, Trajectory
+from tests.plants.robots import packaged
 
 PACKAGE = Path(__file__).parent.parent / "rtcd_jax"
 ANNOTATED = sorted([*PACKAGE.glob("*.py"), *PACKAGE.glob("plants/**/*.py"), *PACKAGE.glob("numerics/**/*.py")])
@@ -70,10 +70,10 @@ def test_axes_of_one_name_have_one_length():
 
 
 def test_functions_are_checked_inside_jit_and_vmap():
-    design = PendulumDesign(jnp.asarray(0.7), jnp.asarray(0.4))
-    assert Pendulum().dynamics(design, jnp.zeros((2, 5)), jnp.zeros((1, 5))).shape == (2, 5)
+    design = packaged("pendulum").Design(jnp.asarray(0.7), jnp.asarray(0.4))
+    assert packaged("pendulum").dynamics(design, jnp.zeros((2, 5)), jnp.zeros((1, 5))).shape == (2, 5)
     with pytest.raises(TypeCheckError, match="u"):
-        jax.jit(Pendulum().dynamics)(design, jnp.zeros((2, 5)), jnp.zeros((1, 4)))
+        jax.jit(packaged("pendulum").dynamics)(design, jnp.zeros((2, 5)), jnp.zeros((1, 4)))
     problem = make_problem(configuration.parse_yaml(configuration.EXAMPLE))
     genomes = jnp.full((3, len(problem.free)), 0.5)
     assert jax.vmap(lambda genome: decode(problem, genome))(genomes).q.shape == (3, 2)

@@ -6,7 +6,6 @@ The programs take turns, so that load on the machine meets all of them; the fast
 """
 
 import argparse
-from collections.abc import Callable
 
 from measure import environment, save
 
@@ -16,33 +15,26 @@ prepare_jax(1)
 
 import jax  # noqa: E402
 import jax.numpy as jnp  # noqa: E402
-import mujoco  # noqa: E402
 import numpy as np  # noqa: E402
 
 from rtcd_jax.analysis.scale.clock import timed  # noqa: E402
+from rtcd_jax.config.plants import PLANTS  # noqa: E402
 from rtcd_jax.numerics.integrate import componentwise, rk4, split  # noqa: E402
 from rtcd_jax.numerics.trigonometry import cos, sin  # noqa: E402
-from rtcd_jax.plants.cartpole import Cartpole, CartpoleDesign  # noqa: E402
-from rtcd_jax.plants.emit import emit  # noqa: E402
-from rtcd_jax.plants.lagrange import Entry, derive  # noqa: E402
+from rtcd_jax.plants import make_plant  # noqa: E402
 
 STEP = 0.01
 
 
-def derived() -> Callable:
-    """The cart-pole's dynamics from its MJCF, the pole's mass and length left open."""
-    model = mujoco.MjModel.from_xml_path(str(Cartpole.mjcf))
-    pole = model.body("pole").id
-    inertia = [Entry("body_inertia", pole, i) for i in range(2)]
-    symbols = [Entry("body_mass", pole), Entry("body_ipos", pole, 2), *inertia]
-    program = emit(derive(model, symbols), len(symbols))
-
-    def dynamics(design, x, u):
-        rod = design.pole_mass * design.pole_length**2 / 3
-        lumped = program.lump([design.pole_mass, design.pole_length, rod, rod])
-        return jnp.stack([x[2], x[3], *program.accelerations(lumped, x[:2], x[2:], u, sin, cos)])
-
-    return dynamics
+def by_hand(plant: Any, design: Any, x: Any, u: Any) -> Any:
+    """The cart-pole's dynamics: accelerations of the pole about a resting pivot, then of the cart, then of both."""
+    moment = design.pole_mass * design.pole_length
+    inertia = design.pole_mass * design.pole_length**2 / 3 + moment * design.pole_length
+    lever, s, c = moment / inertia, sin(x[1]), cos(x[1])
+    pole = lever * plant.gravity * s - plant.pivot_damping / inertia * x[3]
+    force = u[0] - plant.cart_damping * x[2] + moment * (c * pole - s * x[3] * x[3])
+    cart = force / (plant.cart_mass + design.pole_mass - moment * lever * (c * c))
+    return jnp.stack([x[2], x[3], cart, pole + lever * (c * cart)])
 
 
 def main() -> None:
@@ -53,9 +45,10 @@ def main() -> None:
     arguments = parser.parse_args()
     random = np.random.default_rng(0)
     x, u = (jnp.asarray(random.uniform(-1, 1, (rows, arguments.batch))) for rows in (4, 1))
-    design = CartpoleDesign(*jnp.asarray(random.uniform(0.2, 0.3, (2, arguments.batch))))
+    plant: Any = make_plant(PLANTS["cartpole"](), {})
+    design = plant.Design(*jnp.asarray(random.uniform(0.2, 0.3, (2, arguments.batch))))
     programs, compilation = {}, {}
-    for name, dynamics in {"by hand": Cartpole().dynamics, "derived": derived()}.items():
+    for name, dynamics in {"by hand": partial(by_hand, plant), "derived": plant.dynamics}.items():
 
         def steps(design, x, u, dynamics=dynamics):
             def step(_, x):

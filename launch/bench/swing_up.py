@@ -11,8 +11,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from rtcd_jax.plants.cartpole import Cartpole
-from rtcd_jax.plants.pendulum import Pendulum
+from rtcd_jax.config.plants import PackagedPlant
 from rtcd_jax.problem import Problem
 from rtcd_jax.types import Candidate
 
@@ -47,15 +46,15 @@ def numbers_of(candidate: Candidate) -> np.ndarray:
     return np.concatenate([np.atleast_1d(leaf) for leaf in leaves])
 
 
-def pendulum(library, plant: Pendulum, design: Scalars, x: Scalars, u: Scalars) -> list:
-    """plants/pendulum.py; the design is mass and length."""
+def pendulum(library, plant: PackagedPlant, design: Scalars, x: Scalars, u: Scalars) -> list:
+    """The pendulum by hand; the design is mass and length."""
     mass, length = design
     torque = u[0] - plant.damping * x[1] - mass * plant.gravity * length * library.sin(x[0])
     return [x[1], torque / (mass * length**2)]
 
 
-def cartpole(library, plant: Cartpole, design: Scalars, x: Scalars, u: Scalars) -> list:
-    """plants/cartpole.py with the pole a uniform rod; the design is length to its center and mass."""
+def cartpole(library, plant: PackagedPlant, design: Scalars, x: Scalars, u: Scalars) -> list:
+    """The cart-pole by hand, with the pole a uniform rod; the design is length to its center and mass."""
     length, mass = design
     moment, inertia = mass * length, 4 / 3 * mass * length**2
     s, c = library.sin(x[1]), library.cos(x[1])
@@ -70,11 +69,11 @@ def cartpole(library, plant: Cartpole, design: Scalars, x: Scalars, u: Scalars) 
 
 def dynamics(problem: Problem, library) -> Callable[[Scalars, Scalars, Scalars], list]:
     """The rate of the state, of (design, x, u), by a library's sin and cos; ValueError for a robot that is not here."""
-    match problem.plant:
-        case Pendulum() as plant:
-            return lambda design, x, u: pendulum(library, plant, design, x, u)
-        case Cartpole(inertia="rod") as plant:
-            return lambda design, x, u: cartpole(library, plant, design, x, u)
+    plant: Any = problem.config.plant
+    if plant.name == "pendulum":
+        return lambda design, x, u: pendulum(library, plant, design, x, u)
+    if plant.name == "cartpole" and plant.inertia == "rod":
+        return lambda design, x, u: cartpole(library, plant, design, x, u)
     raise ValueError(f"plant.name = {problem.config.plant.name!r}; must be 'pendulum' or 'cartpole' with inertia: rod")
 
 

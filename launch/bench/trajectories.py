@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 from measure import RESULTS, environment, save
-from robots import ROBOTS
+from robots import ROBOTS, problem_of
 
 from rtcd_jax.analysis.scale.clock import timed
 from rtcd_jax.system.devices import prepare_jax
@@ -26,7 +26,7 @@ def measure(robot: str, count: int, seed: int) -> dict[str, float | str]:
     from rtcd_jax.trajectory import plan
     from rtcd_jax.types import Status
 
-    problem = ROBOTS[robot]()
+    problem = problem_of(robot)
     genomes = jnp.asarray(np.random.default_rng(seed).random((count, len(problem.free))))
     candidates = jax.vmap(partial(decode, problem))(genomes)
     compiled, compilation = timed(lambda: jax.jit(partial(plan, problem)).lower(candidates).compile())

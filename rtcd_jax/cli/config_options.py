@@ -6,6 +6,7 @@ from tyro.constructors import StructFieldSpec
 
 from rtcd_jax.cli.options import Branch, section
 from rtcd_jax.config.load import Config
+from rtcd_jax.config.plants import MjcfPlant, PackagedPlant, PlantConfig
 from rtcd_jax.config.schema import Variable
 from rtcd_jax.config.settings import Settings, unit
 
@@ -13,18 +14,39 @@ from rtcd_jax.config.settings import Settings, unit
 def config_branch(config: Config) -> Branch:
     """The options of every key of `config`, whose values are the defaults."""
     plant = config.plant
-    design = {name: _section(variable, plant.design[name]) for name, variable in config.design.items()}
-    weights = {"q": _list(config.weights.q, plant.states), "r": _list(config.weights.r, plant.inputs)}
+    design = {name: _section(config.design[name], unit) for name, unit in config.design_units.items()}
+    weights = {"q": _list(config.weights.q, plant.states), "r": _list(config.weights.r, plant.input_units)}
     task = _section(config.task, ", ".join(plant.states.values()))
     options = type(config.policy).model_fields
     searched = {name: _section(option, unit(options[name])) for name, option in config.policy.variables().items()}
     policy = _section(config.policy, branches=searched)
     branches = {"task": task, "design": _group(design), "weights": _group(weights), "policy": policy}
+    if not isinstance(plant, PackagedPlant):
+        branches["plant"] = _own_plant(plant)
     return _section(config, branches=branches)
 
 
+def _own_plant(plant: PlantConfig) -> Branch:
+    """The constants of a robot of one's own; all else of it is the file's."""
+    stated = plant.model_dump(mode="json")
+    if isinstance(plant, MjcfPlant):
+        units = plant.robot().units
+        fields = [
+            StructFieldSpec(name, float, value, f"constant of {plant.mjcf} [{units[name] or '-'}]")
+            for name, value in plant.values().items()
+        ]
+        return Branch(tuple(fields), lambda **values: plant.with_parameters(values).model_dump(mode="json"))
+    fields = [StructFieldSpec(name, float, value, "constant") for name, value in stated["constants"].items()]
+    return Branch(tuple(fields), lambda **values: stated | {"constants": values})
+
+
 def _section(settings: Settings, unit: str = "", branches: Mapping[str, Branch] | None = None) -> Branch:
-    return section(type(settings), vars(settings), unit, branches)
+    branch = section(type(settings), vars(settings), unit, branches)
+    if not isinstance(settings, Variable):
+        return branch
+    kept = {key: settings.unit for key in ("unit",) if settings.unit}  # the unit is no option
+    fields = tuple(field for field in branch.fields if field.name != "unit")
+    return Branch(fields, lambda **values: values | kept)
 
 
 def _list(weights: Sequence[Variable], units: Mapping[str, str]) -> Branch:

@@ -9,7 +9,8 @@ from typing import Any, Literal, Union, get_args, get_origin
 from pydantic.fields import FieldInfo
 
 from rtcd_jax.config.load import Config
-from rtcd_jax.config.schema import PLANTS, UNIT, PlantConfig, Variable
+from rtcd_jax.config.plants import PLANTS, MjcfPlant, PlantConfig, PythonPlant
+from rtcd_jax.config.schema import UNIT, Variable
 from rtcd_jax.config.settings import Settings, bounds, unit, without_unit
 from rtcd_jax.system.files import replace
 
@@ -23,6 +24,9 @@ All numbers are in SI units, angles in rad; `-` is a number without unit. In the
 variables may be arithmetic, as `2*pi` or `-pi/2`. "the paper" is Girlanda et al., ICRA 2024.
 """
 _HEADING = "| key | unit | default | range | meaning |\n|---|---|---|---|---|"
+
+
+OWN = {"a robot of one's own, from its MJCF": MjcfPlant, "a robot of one's own, from its class": PythonPlant}
 
 
 def reference() -> str:
@@ -44,12 +48,17 @@ def _section(name: str, field: FieldInfo) -> Iterator[str]:
     if kind is PlantConfig:
         for plant, model in PLANTS.items():
             yield f"### {plant}\n"
-            yield f"States: {_named(model.states)}. Inputs: {_named(model.inputs)}.\n"
+            yield f"States: {_named(model().states)}. Inputs: {_named(model().input_units)}.\n"
+            yield _table(_rows(f"{name}.", model))
+        for title, model in OWN.items():
+            yield f"### {title}\n"
             yield _table(_rows(f"{name}.", model))
     elif get_origin(kind) is dict:
         for plant, model in PLANTS.items():
             yield f"### {plant}\n"
-            yield _table([(f"{name}.{key}", unit, "required", "", "a variable") for key, unit in model.design.items()])
+            yield _table(
+                [(f"{name}.{key}", unit, "required", "", "a variable") for key, unit in model().design.items()]
+            )
     else:
         yield _table(_rows(f"{name}.", _model(kind)))
 

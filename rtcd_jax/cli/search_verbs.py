@@ -17,6 +17,7 @@ from rtcd_jax.config.settings import Settings, invalid, refusal
 from rtcd_jax.system.console import Console, silent, table
 from rtcd_jax.system.devices import prepare_jax
 from rtcd_jax.system.errors import ConfigError, Problem, UserError, closest
+from rtcd_jax.system.files import make_folder, replace
 
 if TYPE_CHECKING:
     from rtcd_jax.system.cluster import Cluster
@@ -111,6 +112,7 @@ class OptimizeOptions(Options):
     file: _ConfigPath = Field(description=_EXPERIMENT)
     config: Annotated[Config, PlainValidator(_configuration), FLAT]
     run: Annotated[Path, shown("FOLDER")] = Field(description="run folder, resumed if it is there")
+    dry: bool = Field(default=False, description="only say what is understood of the robot and its task")
     machines: Annotated[Machines, FLAT] = Machines()
 
     @classmethod
@@ -126,6 +128,14 @@ class OptimizeOptions(Options):
 
 def optimize(options: OptimizeOptions, console: Console) -> Exit:
     """Searches, and makes the run's page."""
+    if options.dry:
+        prepare_jax(cache=options.machines.cache)
+        from rtcd_jax.problem import make_problem
+        from rtcd_jax.run.dry import understood
+
+        for line in understood(make_problem(options.config)):
+            console.message(line)
+        return Exit.OK
 
     def search(console: Console, cluster: "Cluster") -> None:
         from rtcd_jax.run.optimize import optimize as run_optimize
@@ -152,6 +162,32 @@ def _finish_page(run: Path, changed: bool, console: Console) -> None:
         console.message(f"the run is finished, but its report failed: {error!r}; `rtcd report {run}` makes it")
     else:
         console.message(f"{page}, and {len(figures)} figures in {figures[0].parent}")
+
+
+class NewOptions(Options):
+    """Write a commented configuration for an MJCF's robot: states, units, limits, numbers that could be designs.
+
+    Example: rtcd new acrobot.xml
+    """
+
+    mjcf: Annotated[Positional[Path], shown("XML")] = Field(description="the robot, a tree of hinges and slides")
+    to: Annotated[Path | None, shown("YAML", "beside the XML")] = Field(default=None, description="file to write")
+
+
+def new(options: NewOptions, console: Console) -> Exit:
+    """Writes the configuration, never over one that is there."""
+    target = options.to or options.mjcf.with_suffix(".yaml")
+    if target.exists():
+        raise UserError(f"{target} is there: choose another file by --to")
+    if target.parent.resolve() != options.mjcf.parent.resolve():
+        raise UserError(f"--to = {target}: must lie beside {options.mjcf}, which it names")
+    from rtcd_jax.plants.draft import draft
+
+    text = draft(options.mjcf)
+    make_folder(target.parent)
+    replace(target, text.encode())
+    console.message(f"{target}; `rtcd optimize {target} --dry` says what is understood of it")
+    return Exit.OK
 
 
 class SweepOptions(Options):

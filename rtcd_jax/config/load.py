@@ -21,12 +21,12 @@ from pydantic import (
     field_validator,
 )
 
-from rtcd_jax.config import yaml12
+from rtcd_jax.config import mjcf, yaml12
+from rtcd_jax.config.plants import PackagedPlant, PlantConfig, read_plant
 from rtcd_jax.config.schema import (
     CheckpointConfig,
     ElitesConfig,
     FunnelConfig,
-    PlantConfig,
     PolicyConfig,
     SearchConfig,
     TaskConfig,
@@ -34,7 +34,6 @@ from rtcd_jax.config.schema import (
     UncertaintyConfig,
     Variable,
     WeightsConfig,
-    read_plant,
 )
 from rtcd_jax.config.settings import Settings, problems_of
 from rtcd_jax.system.errors import ConfigError, Problem, closest, printable
@@ -79,6 +78,12 @@ class Config(Settings):
     def problems(self) -> Iterator[Problem]:
         return _across_sections(dict(self))
 
+    @property
+    def design_units(self) -> dict[str, str]:
+        """Of the design's variables by name, in the plant's order."""
+        own = self.plant.design
+        return {name: own.get(name) or variable.unit for name, variable in self.design.items()}
+
     def variables(self) -> dict[str, Variable]:
         """Every variable by its dotted key: the design in the plant's order, then q, r, and the policy's."""
         variables = {f"design.{name}": variable for name, variable in self.design.items()}
@@ -99,7 +104,7 @@ def _sizes(plant: PlantConfig, task: TaskConfig) -> Iterator[Problem]:
 
 def _weight_sizes(plant: PlantConfig, weights: WeightsConfig) -> Iterator[Problem]:
     yield from _size(("weights", "q"), weights.q, plant.states)
-    yield from _size(("weights", "r"), weights.r, plant.inputs)
+    yield from _size(("weights", "r"), weights.r, plant.input_units)
 
 
 def _size(path: tuple[str, ...], values: tuple, names: Collection[str]) -> Iterator[Problem]:
@@ -133,9 +138,22 @@ def _design_names(plant: PlantConfig, design: dict[str, Variable]) -> Iterator[P
             yield Problem(("design", name), f"is missing; {plant.name}'s design is {', '.join(plant.design)}")
 
 
-def _positive_design(design: dict[str, Variable]) -> Iterator[Problem]:
+def _units(plant: PlantConfig, design: dict[str, Variable], weights: WeightsConfig) -> Iterator[Problem]:
     for name, variable in design.items():
-        if variable.min < SMALLEST_DESIGN:
+        known = plant.design.get(name)
+        if known == "" and not variable.unit:
+            yield Problem(("design", name, "unit"), "is missing: say kg, m, or - where it has none")
+        elif known and variable.unit not in ("", known):
+            yield Problem(("design", name, "unit"), f"must be {known} or left away", variable.unit)
+    for letter, variables in weights:
+        for i, variable in enumerate(variables):
+            if variable.unit:
+                yield Problem(("weights", letter, i, "unit"), "follows from the states and inputs", variable.unit)
+
+
+def _positive_design(plant: PlantConfig, design: dict[str, Variable]) -> Iterator[Problem]:
+    for name, variable in design.items():
+        if isinstance(plant, PackagedPlant) and variable.min < SMALLEST_DESIGN:
             text = f"must be >= {SMALLEST_DESIGN:g}: masses and lengths are positive"
             yield Problem(("design", name, "min"), text, variable.min)
 
@@ -149,7 +167,7 @@ def _positive_weights(weights: WeightsConfig) -> Iterator[Problem]:
 
 
 def _uncertain(plant: PlantConfig, uncertainty: UncertaintyConfig, funnel: FunnelConfig) -> Iterator[Problem]:
-    for section, known in ("design", tuple(plant.design)), ("plant", plant.constants()):
+    for section, known in ("design", tuple(plant.design)), ("plant", plant.uncertain):
         for name in getattr(uncertainty, section):
             if name not in known:
                 path = "uncertainty", section, name
@@ -177,6 +195,7 @@ _ACROSS: tuple[Callable[..., Iterator[Problem]], ...] = (
     _weight_sizes,
     _ends,
     _design_names,
+    _units,
     _positive_design,
     _positive_weights,
     _uncertain,
@@ -232,7 +251,22 @@ def load(path: Path) -> Config:
     if isinstance(data, Mapping) and "sweep" in data:
         problem = Problem(("sweep",), f"makes several runs of this file: they are started by `rtcd sweep {path}`")
         raise ConfigError([problem], str(path))
-    return parse(data, str(path))
+    return parse(with_mjcf(data, path), str(path))
+
+
+def with_mjcf(data: Any, path: Path) -> Any:
+    """What a YAML file holds, with the text of the MJCF that its plant names, which lies beside the file.
+
+    Raises:
+        ConfigError: the MJCF cannot be read.
+    """
+    plant = data.get("plant") if isinstance(data, Mapping) else None
+    if not isinstance(plant, Mapping) or not isinstance(plant.get("mjcf"), str) or "xml" in plant:
+        return data
+    try:
+        return {**data, "plant": {**plant, "xml": mjcf.read_text(path.parent / plant["mjcf"])}}
+    except mjcf.NotMjcf as error:
+        raise ConfigError([Problem(("plant", "mjcf"), str(error), plant["mjcf"])], str(path)) from None
 
 
 def read_yaml(path: Path) -> Any:
@@ -253,7 +287,18 @@ def resolved(config: Config) -> dict[str, Any]:
 
 def dump(config: Config) -> str:
     """The resolved configuration as YAML; `parse_yaml` reads it back to an equal one."""
-    return yaml.safe_dump(resolved(config), sort_keys=False, default_flow_style=None, width=120)
+    return yaml.dump(resolved(config), Dumper=_Dumper, sort_keys=False, default_flow_style=None, width=120)
+
+
+class _Dumper(yaml.SafeDumper):
+    """Texts of several lines, as an MJCF's, stay lines where YAML allows it."""
+
+
+def _text(dumper: yaml.SafeDumper, text: str) -> yaml.Node:
+    return dumper.represent_scalar("tag:yaml.org,2002:str", text, style="|" if "\n" in text else None)
+
+
+_Dumper.add_representer(str, _text)
 
 
 def config_hash(config: Config) -> str:

@@ -7,78 +7,26 @@ import contextlib
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from math import inf
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, cast
+from typing import TYPE_CHECKING, Annotated, Any, Literal, cast
 
-from pydantic import BeforeValidator, Field, GetCoreSchemaHandler, SerializeAsAny
+from pydantic import (
+    BeforeValidator,
+    Field,
+    GetCoreSchemaHandler,
+    SerializeAsAny,
+    SerializerFunctionWrapHandler,
+    model_serializer,
+)
 from pydantic_core.core_schema import CoreSchema, no_info_plain_validator_function
 
 from rtcd_jax.config.arithmetic import arithmetic
+from rtcd_jax.config.plants import PlantConfig
 from rtcd_jax.config.settings import Settings, invalid, refusal
 from rtcd_jax.system.errors import Problem, closest
 from rtcd_jax.volume import VOLUMES
 
 UNIT = "its unit"
 """Stands in a description for the unit that the plant gives."""
-
-
-class PlantConfig(Settings):
-    """A robot's physical constants. The class variables name its states, inputs and design fields, with units."""
-
-    states: ClassVar[dict[str, str]]
-    inputs: ClassVar[dict[str, str]]
-    design: ClassVar[dict[str, str]]
-
-    name: str
-
-    @classmethod
-    def constants(cls) -> tuple[str, ...]:
-        """The numbers that may be uncertain: all but the motors' limits."""
-        fields = cls.model_fields.items()
-        return tuple(name for name, field in fields if field.annotation is float and not name.endswith("_limit"))
-
-
-class PendulumConfig(PlantConfig):
-    states: ClassVar = {"theta": "rad", "theta_dot": "rad/s"}
-    inputs: ClassVar = {"torque": "N m"}
-    design: ClassVar = {"mass": "kg", "length": "m"}
-
-    name: Literal["pendulum"] = Field(default="pendulum", description="torque-limited pendulum (paper, section III)")
-    damping: float = Field(default=0.1, ge=0, le=1e6, description="viscous friction at the pivot [N m s/rad]")
-    gravity: float = Field(default=9.81, ge=1e-6, le=1e6, description="gravitational acceleration [m/s^2]")
-    torque_limit: float = Field(default=2.5, ge=1e-6, le=1e6, description="largest |torque| of the motor [N m]")
-
-
-class CartpoleConfig(PlantConfig):
-    states: ClassVar = {"cart": "m", "theta": "rad", "cart_dot": "m/s", "theta_dot": "rad/s"}
-    inputs: ClassVar = {"force": "N"}
-    design: ClassVar = {"pole_length": "m", "pole_mass": "kg"}
-
-    name: Literal["cartpole"] = Field(default="cartpole", description="force-limited cart-pole (paper, section III)")
-    cart_mass: float = Field(
-        default=1.0731266, ge=1e-6, le=1e6, description="mass of the cart, its motor's inertia included [kg]"
-    )
-    cart_damping: float = Field(default=5.4, ge=0, le=1e6, description="viscous friction of the cart [N s/m]")
-    pivot_damping: float = Field(default=0.0024, ge=0, le=1e6, description="viscous friction at the pivot [N m s/rad]")
-    gravity: float = Field(default=9.81, ge=1e-6, le=1e6, description="gravitational acceleration [m/s^2]")
-    force_limit: float = Field(default=6.0, ge=1e-6, le=1e6, description="largest |force| on the cart [N]")
-    inertia: Literal["rod", "measured"] = Field(
-        default="rod", description="of the pole about its center of mass: a uniform rod's, or the measured constant"
-    )
-
-
-PLANTS: dict[str, type[PlantConfig]] = {"pendulum": PendulumConfig, "cartpole": CartpoleConfig}
-
-
-def read_plant(data: Any) -> PlantConfig:
-    """The constants of the robot that `name` names; pydantic's error for anything else."""
-    if isinstance(data, PlantConfig):
-        return data
-    if not isinstance(data, Mapping) or "name" not in data:
-        raise invalid([Problem((), f"must be a mapping with a `name`; valid: {', '.join(PLANTS)}", data)])
-    name = data["name"]
-    if not isinstance(name, str) or name not in PLANTS:
-        raise invalid([Problem(("name",), f"unknown plant; {closest(name, tuple(PLANTS))}", name)])
-    return PLANTS[name].model_validate(data)
 
 
 def _number(value: Any) -> Any:
@@ -106,6 +54,11 @@ class Variable(Settings):
     min: Number = Field(ge=-1e9, le=1e9, description=f"lower end of the box [{UNIT}]")
     max: Number = Field(ge=-1e9, le=1e9, description=f"upper end of the box [{UNIT}]")
     pinned: bool = Field(default=False, description="hold the initial value instead of searching")
+    unit: str = Field(default="", description="of a design variable of a robot of one's own: its unit [-]")
+
+    @model_serializer(mode="wrap")
+    def _without_empty_unit(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        return {key: value for key, value in handler(self).items() if key != "unit" or value}
 
     @property
     def free(self) -> bool:
@@ -288,7 +241,7 @@ class UncertaintyConfig(Settings):
             return "one exact model"
         shares = self.design | self.plant | {"input limit": self.input_limit}
         parts = [f"{name} ± {share:.3g} of itself" for name, share in shares.items() if share]
-        unit = next(iter(plant.inputs.values()))
+        unit = next(iter(plant.input_units.values()))
         parts += [f"|w(t)| <= {self.input:g} {unit} on the motors' axes"] if self.input else []
         measured = zip(plant.states.items(), self.noise, strict=False)
         parts += [f"{name} measured within {error:g} {unit}" for (name, unit), error in measured if error]

@@ -9,6 +9,7 @@ from typing import Any, final
 import numpy as np
 from jaxtyping import Float, Int
 
+from rtcd_jax.config.plants import PlantConfig, stored_plant
 from rtcd_jax.elite.records import INITIAL, elite_folder, elite_name, read_elite, require_elites
 from rtcd_jax.system.errors import UserError, printable
 
@@ -140,6 +141,20 @@ class Elite:
             raise UserError(f"{folder / name}: {error}") from None
 
     @property
+    def robot(self) -> PlantConfig:
+        """The robot that it is for, all but its parameters.
+
+        Raises:
+            UserError: no such robot.
+        """
+        return stored_plant(self.plant, self.record.get("robot"))
+
+    @property
+    def design_units(self) -> Mapping[str, str]:
+        """Of the design by name."""
+        return self.record.get("units", {}).get("design", {})
+
+    @property
     def policy(self) -> Mapping[str, float]:
         """The policy's options by name; what is absent is as in the configuration's defaults."""
         return self.record.get("policy", {})
@@ -199,8 +214,8 @@ def _is_measurable(value: Any) -> bool:
 
 def _require_kinds(record: Mapping[str, Any]) -> None:
     """Raises UserError where a value of `NNN.json` is of another kind than a run writes."""
-    kinds = {"plant": str, "parameters": Mapping, "policy": Mapping, "state_limits": list, "epsilon": float | int,
-             "confidence": float | int}  # fmt: skip
+    kinds = {"plant": str, "robot": Mapping, "parameters": Mapping, "policy": Mapping, "state_limits": list,
+             "epsilon": float | int, "confidence": float | int}  # fmt: skip
     stored = {key: value for key in kinds if (value := record.get(key)) is not None}
     wrong = [key for key, value in stored.items() if not isinstance(value, kinds[key])]
     for key in {"parameters", "policy"} & stored.keys() - set(wrong):

@@ -145,7 +145,7 @@ def _robot(bundle: Bundle) -> dict[str, str]:
     with jax.enable_x64(True):
         edits = jax.tree.map(np.asarray, bundle.plant.edit_model(bundle.design))
     return {
-        "robot.xml": robot.mjcf(bundle.plant.mjcf, edits, elite.u_max.tolist()),
+        "robot.xml": robot.mjcf(bundle.plant.xml, edits, elite.u_max.tolist()),
         "robot.urdf": robot.urdf(elite.plant, bundle.model, elite.state_limits.tolist(), elite.u_max.tolist()),
     }
 

@@ -15,9 +15,8 @@ from rtcd_jax.elite.elite import Elite, ellipsoid_axes
 from rtcd_jax.elite.funnel import FunnelInterpolant
 from rtcd_jax.export.proof import ProvedFunnel
 from rtcd_jax.export.rate import ControlRate, control_rate
-from rtcd_jax.plants import plant_class
+from rtcd_jax.plants import model_of, plant_of
 from rtcd_jax.plants.base import Plant
-from rtcd_jax.plants.mjx import model_of
 from rtcd_jax.system.errors import UserError
 
 SAMPLED = "V = (x - x*)'S(t)(x - x*) <= rho(t), S cubic Hermite, log rho linear; what was sampled is promised at knots"
@@ -165,8 +164,8 @@ def read_bundle(
     certificate = standing(folder, name, lambda done, of: show(done, of, "checking the certificate"))
     proof = ProvedFunnel.read(certificate_path(folder, name)) if certificate.proved else None
     with jax.enable_x64(True):
-        plant, design = plant_class(elite.plant).from_parameters(elite.parameters)
-    model = model_of(elite.plant, elite.parameters)
+        plant, design = plant_of(elite.robot, elite.parameters, elite.design_units)
+    model = model_of(elite.robot, elite.parameters)
     return Bundle(
         name=name,
         label=label,

@@ -2,7 +2,6 @@
 
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
-from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree as Xml
 
@@ -20,6 +19,9 @@ _PLACES = {
     "body_quat": ("body", ".", "quat"),
     "dof_damping": ("joint", ".", "damping"),
     "dof_armature": ("joint", ".", "armature"),
+    "jnt_stiffness": ("joint", ".", "stiffness"),
+    "jnt_pos": ("joint", ".", "pos"),
+    "actuator_gear": ("actuator/*", ".", "gear"),
     "geom_pos": ("geom", ".", "pos"),
     "geom_quat": ("geom", ".", "quat"),
     "geom_size": ("geom", ".", "size"),
@@ -30,13 +32,13 @@ _SLIDE, _HINGE = 2, 3
 _SPHERE, _CAPSULE, _CYLINDER, _BOX = 2, 3, 5, 6
 
 
-def mjcf(path: Path, edits: ModelEdits, input_limits: Sequence[float]) -> str:
-    """The MJCF at `path` with a design's `edits` in it and its inputs limited to +- `input_limits`.
+def mjcf(xml: str, edits: ModelEdits, input_limits: Sequence[float]) -> str:
+    """The MJCF with a design's `edits` in it and its inputs limited to +- `input_limits`.
 
     Raises:
         ValueError: an edit of an attribute or of an element that cannot be found in the file.
     """
-    root = Xml.fromstring(path.read_text(), Xml.XMLParser(target=Xml.TreeBuilder(insert_comments=True)))
+    root = Xml.fromstring(xml, Xml.XMLParser(target=Xml.TreeBuilder(insert_comments=True)))
     for attribute, edit in edits.items():
         if isinstance(edit, Mapping):
             for name, row in edit.items():

@@ -2,7 +2,6 @@
 
 import abc
 from collections.abc import Mapping
-from pathlib import Path
 from typing import ClassVar
 
 import equinox as eqx
@@ -30,7 +29,8 @@ class Plant(eqx.Module):
     convention: ClassVar[str]
     """Where the positions are zero, and which way positions, velocities and inputs point."""
     Design: ClassVar[type[eqx.Module]]
-    mjcf: ClassVar[Path]
+    xml: ClassVar[str]
+    """The text of its MJCF."""
 
     @property
     def n(self) -> int:
@@ -52,8 +52,8 @@ class Plant(eqx.Module):
         """State derivative in SI units per second; the design's leaves are broadcast to the states' trailing axes."""
 
     @abc.abstractmethod
-    def energy(self, design: eqx.Module, x: Float[Array, "n *batch"]) -> Float[Array, "*batch"]:
-        """Mechanical energy [J]; for u = 0 its rate is the power lost in the dampers."""
+    def motor_speeds(self, design: eqx.Module, x: Float[Array, "n *batch"]) -> Float[Array, "m *batch"]:
+        """v with which the input u has the power u_i v_i."""
 
     @abc.abstractmethod
     def parameters(self, design: eqx.Module) -> dict[str, float]:
@@ -70,10 +70,10 @@ class Plant(eqx.Module):
 
     @abc.abstractmethod
     def edit_model(self, design: eqx.Module) -> ModelEdits:
-        """What `design` and the constants replace in the MuJoCo model that `mjcf` compiles to.
+        """What `design` and the constants replace in the MuJoCo model that `xml` compiles to.
 
-        Keyed by the model's attribute. The value is the whole attribute ("opt.gravity"), or its rows by
-        the name of the body (`body_*`), joint (`jnt_*`, `dof_*`) or geom (`geom_*`) that they belong to.
+        Keyed by the model's attribute. The value is the whole attribute ("opt.gravity"), or its rows by the name of
+        the body (`body_*`), joint (`jnt_*`, `dof_*`), motor (`actuator_*`) or geom (`geom_*`) that they belong to.
         With contacts, joint limits and all other constraints off, the edited model must move as the
         recompiled one: then derived attributes (`body_subtreemass`, `dof_invweight0`, ...) play no part.
         """

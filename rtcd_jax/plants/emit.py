@@ -7,7 +7,7 @@ and equal expressions are written once. So what is lumped of masses and lengths 
 others with the same arithmetic.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -57,7 +57,7 @@ class Program:
         return [registers[i] for i in self.lumped]
 
     def accelerations(
-        self, lumped: Sequence[Any], q: Sequence[Any], v: Sequence[Any], u: Sequence[Any], sin: Callable, cos: Callable
+        self, lumped: Sequence[Any], q: Iterable[Any], v: Iterable[Any], u: Iterable[Any], sin: Callable, cos: Callable
     ) -> list[Any]:
         """v' of positions q, velocities v and inputs u; a float where it depends on nothing."""
         registers: list[Any] = [None] * self.registers

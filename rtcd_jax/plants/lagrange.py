@@ -10,7 +10,7 @@ the model; all derivatives are exact. The terms of every body follow from its ce
 # pyright: reportAttributeAccessIssue=false
 # (mujoco ships no types for its native module.)
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -65,15 +65,15 @@ class Equations:
         return sum(len(p.terms) for row in (*self.mass, self.slopes, factors) for p in row)
 
 
-def derive(model: mujoco.MjModel, symbols: Sequence[Entry] = ()) -> Equations:
-    """The equations of `model`, in which the numbers `symbols` are left open.
+def derive(model: mujoco.MjModel, symbols: Mapping[Entry, int] | None = None) -> Equations:
+    """The equations of `model`, in which the numbers `symbols` are left open; equal ones are one symbol.
 
     Raises:
         UserError: the model is no tree of hinges and slides with smooth dynamics, or its closed form is too large.
     """
     if faults := list(unsupported(model)):
         raise UserError("; ".join(faults))
-    ring = _Ring(model, symbols)
+    ring = _Ring(model, symbols or {})
     nv, angles = model.nv, ring.angles
     bodies = {0: _Frame([ring.zero] * 3, [[ring.number(float(i == j)) for j in range(3)] for i in range(3)], {})}
     mass = [[ring.zero] * (i + 1) for i in range(nv)]
@@ -167,10 +167,10 @@ class _Frame(NamedTuple):
 class _Ring:
     """The model's numbers as polynomials."""
 
-    def __init__(self, model: mujoco.MjModel, symbols: Sequence[Entry]):
-        self.model, self.width = model, model.nv + len(symbols)
+    def __init__(self, model: mujoco.MjModel, symbols: Mapping[Entry, int]):
+        self.model, self.width = model, model.nv + len(set(symbols.values()))
         self.angles = tuple(int(kind) == HINGE for kind in model.jnt_type)
-        self.place = {entry: model.nv + i for i, entry in enumerate(symbols)}
+        self.place = {entry: model.nv + symbol for entry, symbol in symbols.items()}
         self.zero = Laurent({})
 
     def monomial(self, i: int, power: int = 1, factor: Coefficient = 1.0) -> Laurent:

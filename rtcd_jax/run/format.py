@@ -7,6 +7,7 @@ import jax
 import numpy as np
 
 from rtcd_jax.config.load import config_hash
+from rtcd_jax.config.plants import PLANTS
 from rtcd_jax.evaluation import elite_budget
 from rtcd_jax.numerics.proportion import failure_bound
 from rtcd_jax.policy import input_jumps, options
@@ -58,6 +59,7 @@ def record_of(
     design = host.candidate.design
     return {
         "plant": config.plant.name,
+        **({} if config.plant.name in PLANTS else {"robot": config.plant.model_dump(mode="json")}),
         "parameters": plant.parameters(design),
         "design": {name: float(getattr(design, name)) for name in plant.design_units},
         "weights": {"q": host.candidate.q, "r": host.candidate.r},

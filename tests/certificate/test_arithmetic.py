@@ -13,7 +13,7 @@ import pytest
 from rtcd_jax.certificate import check
 from rtcd_jax.certificate.check import PI, PI_ERROR, Q, Space, Taylor, polynomial
 from rtcd_jax.certificate.prove.closed_loop import rate
-from rtcd_jax.plants import PLANTS
+from tests.plants.robots import packaged
 
 SPACE = Space(2, 4, 5)
 
@@ -188,7 +188,7 @@ def test_cofactors():
 @pytest.mark.parametrize("name", check.PLANTS)
 def test_models_are_the_plants(name):
     random = np.random.default_rng(3)
-    plant = PLANTS[name]()
+    plant = packaged(name)
     design = plant.Design(*(jnp.asarray(v) for v in random.uniform(0.2, 0.7, 2)))
     parameters, model = plant.parameters(design), check.PLANTS[name]
     assert (model.states, model.units, (model.input_unit,)) == (plant.state_names, plant.state_units, plant.input_units)

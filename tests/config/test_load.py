@@ -19,7 +19,8 @@ from rtcd_jax.config.load import (
     parse_yaml,
     resolved,
 )
-from rtcd_jax.config.schema import PLANTS, Variable
+from rtcd_jax.config.plants import PLANTS
+from rtcd_jax.config.schema import Variable
 from rtcd_jax.config.settings import Settings, bounds
 from rtcd_jax.system.errors import ConfigError
 from tests.paths import CONFIGS
@@ -69,8 +70,11 @@ REFUSED = {
     "misspelt plant key": ({"plant.gravty": 1}, "plant.gravty = 1: unknown key; did you mean 'gravity'?"),
     "unlike any key": ({"elites.xyz": 8}, "elites.xyz = 8: unknown key; valid: count, distance, trials, directions"),
     "misspelt plant": ({"plant.name": "pendulm"}, "plant.name = 'pendulm': unknown plant; did you mean 'pendulum'?"),
-    "plant is no name": ({"plant.name": 3}, "plant.name = 3: unknown plant; valid: pendulum"),
-    "plant without a name": ({"plant": {}}, "plant = {}: must be a mapping with a `name`; valid: pendulum"),
+    "plant is no name": ({"plant.name": 3}, "plant.name = 3: unknown plant; valid: acrobot"),
+    "plant without a name": (
+        {"plant": {}},
+        "plant = {}: must be a mapping with a `name`, or with `mjcf: FILE`; valid names: acrobot",
+    ),
     "plant is no mapping": ({"plant": "pendulum"}, "plant = 'pendulum': must be a mapping with a `name`"),
     "misspelt objective": (
         {"search.objective": "inlets"},
@@ -493,16 +497,12 @@ def test_the_underactuated_box_holds_no_motor_that_can_lift_the_bob():
 
 @pytest.mark.parametrize("name", PLANTS)
 def test_plants_are_described_as_they_are(name):
-    described, plant = PLANTS[name], plants.plant_class(name)
+    described = PLANTS[name]()
+    plant = plants.make_plant(described, {})
     assert tuple(described.states.items()) == tuple(zip(plant.state_names, plant.state_units, strict=True))
-    assert tuple(described.inputs.items()) == tuple(zip(plant.input_names, plant.input_units, strict=True))
+    assert tuple(described.input_units.items()) == tuple(zip(plant.input_names, plant.input_units, strict=True))
     assert described.design == dict(plant.design_units)
-    constants = described(name=name).model_dump(exclude={"name"})
-    assert vars(plant()) == constants
-
-
-def test_every_plant_is_described():
-    assert PLANTS.keys() == plants.PLANTS.keys()
+    assert vars(plant) == described.values()
 
 
 def leaves(model):

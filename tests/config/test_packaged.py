@@ -29,5 +29,5 @@ def test_paths_are_no_names(path):
 
 
 def test_a_misspelt_name_is_told_the_one_that_was_meant():
-    with pytest.raises(ConfigError, match=r"^smok: no such file .*; did you mean 'smoke'\? Valid: cartpole_cautious, "):
+    with pytest.raises(ConfigError, match=r"^smok: no such file .*; did you mean 'smoke'\? Valid: acrobot, "):
         config_path(Path("smok"))

@@ -6,9 +6,10 @@ from scipy.integrate import solve_ivp
 
 from rtcd_jax.elite.elite import Elite
 from rtcd_jax.elite.funnel import FunnelInterpolant, linearized
-from rtcd_jax.elite.simulators import CLOSED_FORMS, dynamics_of
+from rtcd_jax.elite.simulators import dynamics_of, mujoco_of
 from tests.analysis.report.loops import LOOPS, stored
 from tests.certificate import balance, swing
+from tests.plants.robots import BY_HAND
 
 
 def linear(plant, x, u):
@@ -100,20 +101,16 @@ def test_an_angle_s_error_is_not_wrapped():
 def test_the_linearization_is_exact_to_rounding(plant):
     x = np.random.default_rng(1).normal(size=(5, LOOPS[plant].Q.shape[0]))
     u = np.linspace(-1, 1, 5)
-    a, b = linearized(CLOSED_FORMS[plant](LOOPS[plant].PARAMETERS), x, u[:, None])
+    a, b = linearized(BY_HAND[plant](LOOPS[plant].PARAMETERS), x, u[:, None])
     for k in range(5):
         true_a, true_b = linear(plant, x[k], u[k])
         np.testing.assert_allclose(a[k], true_a, atol=1e-5)
         np.testing.assert_allclose(b[k], true_b, atol=1e-5)
 
 
-def test_a_plant_without_a_closed_form_is_asked_of_mujoco(monkeypatch):
-    arrays, record = stored("pendulum")
-    told = interpolant(arrays, record)
-    monkeypatch.delitem(CLOSED_FORMS, "pendulum")
-    asked = interpolant(arrays, record)
-    np.testing.assert_allclose(asked.loop.rates, told.loop.rates, rtol=1e-8)
-    np.testing.assert_allclose(asked.value_rates, told.value_rates, rtol=1e-4, atol=1e-4)
+def test_closed_form_and_mujoco_are_one_robot():
+    elite = interpolant(*stored("pendulum")).elite
     x = np.random.default_rng(0).normal(size=(4, 2))
     expected = swing.rate(x.T, np.zeros(4)).T
-    np.testing.assert_allclose(dynamics_of(asked.elite)(x, np.zeros((4, 1))), expected, rtol=1e-8)
+    for f in dynamics_of(elite), mujoco_of(elite, 4):
+        np.testing.assert_allclose(f(x, np.zeros((4, 1))), expected, rtol=1e-8)

@@ -12,7 +12,7 @@ from rtcd_jax.certificate.check.file import read_goal
 from rtcd_jax.export import rate, source, tables
 from rtcd_jax.export.proof import ProvedFunnel
 from rtcd_jax.export.rate import control_rate
-from rtcd_jax.plants.mjx import CpuDynamics
+from rtcd_jax.plants.model import CpuDynamics
 from tests.export.conftest import module
 from tests.export.test_controller import COMPILER, OPTIMIZED, STRICT, bind, needs_compiler
 

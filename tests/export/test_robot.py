@@ -8,9 +8,9 @@ import mujoco
 import numpy as np
 import pytest
 
+from rtcd_jax.config.plants import PLANTS
 from rtcd_jax.export import robot
-from rtcd_jax.plants.mjx import CpuDynamics
-from rtcd_jax.plants.pendulum import Pendulum
+from rtcd_jax.plants.model import CpuDynamics
 
 
 def mass_matrix_and_forces(model, position, velocity):
@@ -117,9 +117,9 @@ def test_every_input_has_a_transmission_of_its_own(export):
 
 def test_an_edit_that_the_file_cannot_take_is_refused_by_name():
     with pytest.raises(ValueError, match=r"geom_rgba edited; known: body_mass"):
-        robot.mjcf(Pendulum.mjcf, {"geom_rgba": {"bob": np.ones(4)}}, [2.5])
+        robot.mjcf(PLANTS["pendulum"].xml, {"geom_rgba": {"bob": np.ones(4)}}, [2.5])
     with pytest.raises(ValueError, match=r"body_mass is edited, but the MJCF has no body\[@name='ball'\]"):
-        robot.mjcf(Pendulum.mjcf, {"body_mass": {"ball": np.ones(())}}, [2.5])
+        robot.mjcf(PLANTS["pendulum"].xml, {"body_mass": {"ball": np.ones(())}}, [2.5])
 
 
 @pytest.mark.parametrize("joint", ['type="ball"', 'type="hinge" pos="0 0 1"'])

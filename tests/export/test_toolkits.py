@@ -7,7 +7,7 @@ cart-pole of robust_codesign. The robots are C MuJoCo's models of the exported d
 import numpy as np
 import pytest
 
-from rtcd_jax.plants.mjx import CpuDynamics
+from rtcd_jax.plants.model import CpuDynamics
 
 STEP = 0.002
 

@@ -1,4 +1,4 @@
-"""Every test of this folder that takes `robot` runs on every robot; a new one is a line in ROBOTS."""
+"""Every test of this folder that takes `robot` runs on every packaged robot."""
 # pyright: reportAttributeAccessIssue=false
 # (mujoco ships no types for its native module.)
 
@@ -12,86 +12,56 @@ import mujoco
 import numpy as np
 import pytest
 
-from rtcd_jax.plants import PLANTS, plant_class
+from rtcd_jax.config.load import load
+from rtcd_jax.config.plants import PLANTS
+from rtcd_jax.plants import model_of
 from rtcd_jax.plants.base import Plant
 from rtcd_jax.plants.mjx import MjxStepper
+from tests.paths import CONFIGS
+from tests.plants.robots import packaged
 
 STATES = 32
 
 
-def _redesign_pendulum(spec: mujoco.MjSpec, parameters: dict[str, float]) -> None:
-    length = parameters["l"]
-    spec.option.gravity = [0, 0, -parameters["g"]]
-    body = spec.body("bob")
-    body.mass, body.ipos = parameters["m"], [0, 0, -length]
-    spec.joint("theta").damping[0] = parameters["b"]
-    spec.geom("bob").pos = [0, 0, -length]
-    spec.geom("rod").pos = [0, 0, -length / 2]
-    spec.geom("rod").size = [spec.geom("rod").size[0], length / 2, 0]
+QUICK = ("pendulum", "cartpole")
+"""Robots that MJX is compiled for in the fast suite; for the others it takes minutes."""
 
 
-def _redesign_cartpole(spec: mujoco.MjSpec, parameters: dict[str, float]) -> None:
-    center, inertia = [0, 0, parameters["lp"]], parameters["inertia_about_com"]
-    spec.option.gravity = [0, 0, -parameters["g"]]
-    spec.body("cart").mass = parameters["Mc"]
-    pole = spec.body("pole")
-    pole.mass, pole.ipos, pole.inertia = parameters["Mp"], center, [inertia, inertia, pole.inertia[2]]
-    spec.joint("cart").damping[0] = parameters["Beq"]
-    spec.joint("theta").damping[0] = parameters["Bp"]
-    spec.geom("pole").pos = center
-    spec.geom("pole").size = [spec.geom("pole").size[0], parameters["lp"], 0]
-
-
-class Row(NamedTuple):
-    constants: dict[str, float]
-    lowest: dict[str, float]
-    highest: dict[str, float]
-    redesign: Callable[[mujoco.MjSpec, dict[str, float]], None]
-
-
-ROBOTS = {
-    "pendulum": Row(
-        {"damping": 0.13, "gravity": 9.7},
-        {"mass": 0.6, "length": 0.4},
-        {"mass": 0.8, "length": 0.6},
-        _redesign_pendulum,
-    ),
-    "cartpole": Row(
-        {"cart_mass": 1.1, "cart_damping": 5.2, "pivot_damping": 0.003, "gravity": 9.7},
-        {"pole_length": 0.1778, "pole_mass": 0.127},
-        {"pole_length": 0.3, "pole_mass": 0.3},
-        _redesign_cartpole,
-    ),
-}
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """What compiles MJX for another robot is slow."""
+    for item in items:
+        callspec = getattr(item, "callspec", None)
+        if item.path.name == "test_mjx.py" and callspec and callspec.params.get("robot", QUICK[0]) not in QUICK:
+            item.add_marker(pytest.mark.slow)
 
 
 class Robot(NamedTuple):
     """A plant with constants that differ from its MJCF's, `STATES` random designs, states and inputs."""
 
+    name: str
     plant: Plant
     designs: eqx.Module
     x: jax.Array
     u: jax.Array
-    redesign: Callable[[mujoco.MjSpec, dict[str, float]], None]
 
     def design(self, index: int) -> eqx.Module:
         return jax.tree.map(lambda leaf: leaf[index], self.designs)
 
     def recompiled(self, index: int) -> mujoco.MjModel:
         """The model of design `index`, edited as a specification and compiled from scratch."""
-        spec = mujoco.MjSpec.from_file(str(self.plant.mjcf))
-        self.redesign(spec, self.plant.parameters(self.design(index)))
-        return spec.compile()
+        return model_of(PLANTS[self.name](), self.plant.parameters(self.design(index)))
 
 
 def _random_robot(name: str) -> Robot:
-    row = ROBOTS[name]
+    """Constants a tenth beside their defaults, designs within a third of what its configuration begins with."""
     random = np.random.default_rng(0)
-    plant = plant_class(name)(**row.constants)
-    fields = {key: jnp.asarray(random.uniform(row.lowest[key], row.highest[key], STATES)) for key in row.lowest}
+    constants = {key: value * random.uniform(0.9, 1.1) + 1e-3 for key, value in PLANTS[name]().values().items()}
+    plant = packaged(name, **constants)
+    design = load(next(CONFIGS.glob(f"{name}*.yaml"))).design
+    fields = {key: jnp.asarray(variable.initial * random.uniform(0.7, 1.3, STATES)) for key, variable in design.items()}
     x = jnp.asarray(random.uniform(-4, 4, (STATES, plant.n)))
     u = jnp.asarray(random.uniform(-1, 1, (STATES, plant.m)) * np.asarray(plant.input_limit))
-    return Robot(plant, plant.Design(**fields), x, u, row.redesign)
+    return Robot(name, plant, plant.Design(**fields), x, u)
 
 
 @pytest.fixture(scope="session", params=PLANTS)

@@ -1,115 +1,98 @@
-"""An MJCF that moves otherwise than the equations makes no problem, whatever of MuJoCo's features is the reason."""
+"""An MJCF makes a problem if it moves as its equations say, and is refused by name otherwise."""
 
-import re
-
+import jax
+import numpy as np
 import pytest
 
-from rtcd_jax import plants
-from rtcd_jax.config.load import EXAMPLE, parse_yaml
-from rtcd_jax.plants.cartpole import Cartpole
-from rtcd_jax.plants.pendulum import Pendulum
+from rtcd_jax.config.load import EXAMPLE, parse
+from rtcd_jax.config.plants import PLANTS
+from rtcd_jax.plants.agreement import require_agreement
 from rtcd_jax.problem import make_problem
 from rtcd_jax.system.errors import UserError
+from tests.plants.robots import design, packaged
 
 MOTOR = '<motor name="torque" joint="theta" gear="1"/>'
 HINGE = 'type="hinge" axis="0 -1 0"'
 RK4 = 'integrator="RK4"'
 TENDON = '<tendon><fixed name="t"><joint joint="theta" coef="1"/></fixed></tendon></mujoco>'
+SET = """
+theta: {damping: 0.1}
+body.bob: {mass: mass, ipos: [0, 0, -length], inertia: [0, 0, 0]}
+"""
 
 
-@pytest.fixture
-def pendulum(tmp_path, monkeypatch):
-    """Makes the problem of the example's pendulum with replacements in its MJCF."""
+def pendulum(*replacements):
+    """The problem of the example's pendulum as a robot of one's own, with replacements in its MJCF."""
+    text = PLANTS["pendulum"].xml
+    for old, new in replacements:
+        assert text.count(old) == 1
+        text = text.replace(old, new)
+    from rtcd_jax.config import yaml12
 
-    def make(*replacements):
-        text = Pendulum.mjcf.read_text()
-        for old, new in replacements:
-            assert text.count(old) == 1
-            text = text.replace(old, new)
-        path = tmp_path / "robot.xml"
-        path.write_text(text)
-        monkeypatch.setitem(plants.PLANTS, "pendulum", type("Robot", (Pendulum,), {"mjcf": path}))
-        return make_problem(parse_yaml(EXAMPLE))
-
-    return make
-
-
-@pytest.mark.parametrize(
-    "replacement",
-    {
-        "gear": (MOTOR, MOTOR.replace('gear="1"', 'gear="2"')),
-        "sign": (MOTOR, MOTOR.replace('gear="1"', 'gear="-1"')),
-        "position actuator": (MOTOR, '<position name="torque" joint="theta" kp="1"/>'),
-        "velocity actuator": (MOTOR, '<velocity name="torque" joint="theta" kv="1"/>'),
-        "actuator's own damping": (MOTOR, '<general name="torque" joint="theta" biastype="affine" biasprm="0 0 -1"/>'),
-        "stiffness": (HINGE, f'{HINGE} stiffness="0.01"'),
-        "springdamper": (HINGE, f'{HINGE} springdamper="1 1"'),
-        "armature": (HINGE, f'{HINGE} armature="1e-4"'),
-        "ref": (HINGE, f'{HINGE} ref="0.5"'),
-        "joint's place": (HINGE, f'{HINGE} pos="0.01 0 0"'),
-        "gravity compensation": ('<body name="bob">', '<body name="bob" gravcomp="0.1">'),
-        "viscosity": (RK4, f'{RK4} viscosity="1"'),
-        "polynomial damping": ('damping="0.1"', 'damping="0.1 0.05"'),
-        "actuation switched off": (f"<option {RK4}", f'<option {RK4} actuatorgroupdisable="0"'),
-    }.values(),
-)
-def test_a_feature_that_the_equations_lack_is_refused_with_the_numbers(pendulum, replacement):
-    number = r"-?[\d.e-]+"
-    words = (
-        rf"^robot\.xml moves otherwise than the equations of Robot: at mass = {number}, length = {number}, "
-        rf"theta = {number}, theta_dot = {number}, torque = {number} "
-        rf"MuJoCo's accelerations are \({number}\), the equations' \({number}\)$"
-    )
-    with pytest.raises(UserError, match=words):
-        pendulum(replacement)
+    data = yaml12.read(EXAMPLE)
+    data["plant"] = {"mjcf": "robot.xml", "xml": text, "inputs": {"torque": {"limit": 2.5}}, "set": yaml12.read(SET)}
+    for name, unit in ("mass", "kg"), ("length", "m"):
+        data["design"][name]["unit"] = unit
+    return make_problem(parse(data))
 
 
 @pytest.mark.parametrize(
     "replacements",
     {
         "none": (),
-        "a motor on a tendon that is the joint": (
-            (MOTOR, '<motor name="torque" tendon="t"/>'),
-            ("</mujoco>", TENDON),
-        ),
+        "gear": ((MOTOR, MOTOR.replace('gear="1"', 'gear="-2"')),),
+        "armature": ((HINGE, f'{HINGE} armature="1e-4"'),),
+        "joint's place": ((HINGE, f'{HINGE} pos="0 0.01 0"'),),
         "the mirror image": ((HINGE, 'type="hinge" axis="0 1 0"'),),
         "degrees where nothing is an angle": (('angle="radian"', 'angle="degree"'),),
-        "numbers that every design replaces": (
-            ('mass="0.7" pos="0 0 -0.4"', 'mass="7" pos="0 0 -4"'),
-            ('damping="0.1"', 'damping="3"'),
-        ),
+        "numbers that every design replaces": (('mass="0.7" pos="0 0 -0.4"', 'mass="7" pos="0 0 -4"'),),
+        "limits of the control": ((MOTOR, MOTOR.replace('gear="1"', 'ctrllimited="true" ctrlrange="-1 1"')),),
+        "another integrator": ((RK4, 'integrator="Euler"'),),
     }.values(),
 )
-def test_what_moves_the_same_is_taken(pendulum, replacements):
-    assert pendulum(*replacements).plant.mjcf.name == "robot.xml"
+def test_what_has_equations_is_taken(replacements):
+    assert pendulum(*replacements).plant.state_names == ("theta", "theta_dot")
 
 
 @pytest.mark.parametrize(
     ("replacement", "words"),
     [
-        ((RK4, 'integrator="Euler"'), r"robot.xml: robot.xml is no smooth model of Robot: its integrator must be"),
-        ((RK4, f'{RK4} solver="PGS"'), r"robot.xml: .*PGS"),
-        (("<worldbody>", "<worldbody"), r"robot.xml: XML"),
+        ((MOTOR, '<position name="torque" joint="theta" kp="1"/>'), r"an actuator that is no motor .*actuator torque"),
+        ((MOTOR, '<velocity name="torque" joint="theta" kv="1"/>'), r"an actuator that is no motor .*actuator torque"),
+        (('<body name="bob">', '<body name="bob" gravcomp="0.1">'), r"gravity compensation: body bob"),
+        ((RK4, f'{RK4} viscosity="1"'), r"a fluid: option viscosity = 1"),
+        (("</mujoco>", TENDON), r"tendons: tendon t"),
+        (('contype="0"', 'contype="1"'), r"contacts are on .*geom motor, hub, rod, bob"),
+        ((HINGE, f'{HINGE} frictionloss="0.1"'), r"friction loss, which is not smooth: joint theta"),
+        ((HINGE, f'{HINGE} limited="true" range="-1 1"'), r"joint limits are on .*task.state_limits.*joint theta"),
+        ((HINGE, f'{HINGE} ref="0.5"'), r"task.goal = .* is no equilibrium"),
+        ((RK4, f'{RK4} solver="PGS"'), r"PGS"),
+        (('damping="0.1"/>', 'damping="0.1 0.05"/>'), r"moves otherwise than its equations: at mass = "),
+        ((f"<option {RK4}", f'<option {RK4} actuatorgroupdisable="0"'), r"moves otherwise than its equations"),
+        (("</actuator>", '<motor joint="theta"/></actuator>'), r"plant.mjcf.*motor number 1 has no name"),
+        ((HINGE, 'type="ball"'), r"plant.mjcf.*joint theta is a ball: use hinges and slides"),
+        (("<worldbody>", "<worldbody"), r"plant.mjcf.*is no XML"),
+        (('body name="bob"', 'body name="ball"'), r"plant.set.body.bob: is no body, joint, motor or geom of the MJCF"),
     ],
 )
-def test_a_file_that_mujoco_or_mjx_cannot_use_is_named(pendulum, replacement, words):
+def test_what_has_none_is_refused_by_name_in_one_line(replacement, words):
     with pytest.raises(UserError, match=words) as caught:
         pendulum(replacement)
     assert len(str(caught.value).splitlines()) == 1
 
 
-def test_both_accelerations_of_a_robot_of_two_joints_are_compared(tmp_path, monkeypatch):
-    path = tmp_path / "robot.xml"
-    path.write_text(
-        re.sub(r'(name="theta" type="hinge" axis="0 -1 0")', r'\1 stiffness="1"', Cartpole.mjcf.read_text())
+def test_an_mjcf_that_moves_otherwise_is_refused_with_the_numbers():
+    plant = packaged("pendulum")
+    xml = plant.xml.replace('gear="1"', 'gear="2"')
+    other = type("Robot", (type(plant),), {"xml": xml})(*jax.tree.leaves(plant))
+    number = r"-?[\d.e-]+"
+    words = (
+        rf"^the MJCF of Robot moves otherwise than its equations: at mass = {number}, length = {number}, "
+        rf"theta = {number}, theta_dot = {number}, torque = {number} "
+        rf"MuJoCo's accelerations are \({number}\), the equations' \({number}\)$"
     )
-    monkeypatch.setitem(plants.PLANTS, "cartpole", type("Robot", (Cartpole,), {"mjcf": path}))
-    variable = "{initial: 0.2, min: 0.1, max: 0.3}"
-    text = f"""
-plant: {{name: cartpole}}
-task: {{start: [0, 3.141592653589793, 0, 0], goal: [0, 0, 0, 0], state_limits: [0.3, .inf, .inf, .inf]}}
-design: {{pole_length: {variable}, pole_mass: {variable}}}
-weights: {{q: [{variable}, {variable}, {variable}, {variable}], r: [{variable}]}}
-"""
-    with pytest.raises(UserError, match=r"MuJoCo's accelerations are \(\S+, \S+\), the equations' \(\S+, \S+\)$"):
-        make_problem(parse_yaml(text))
+    random = np.random.default_rng(0)
+    with pytest.raises(UserError, match=words):
+        require_agreement(
+            other, [design("pendulum", mass=0.7, length=0.4)], random.normal(size=(8, 2)), random.normal(size=(8, 1))
+        )

@@ -20,7 +20,7 @@ def accelerations(model, values=(), symbols=(), seed=0):
     """Those of the closed form, with `values` for its `symbols`, and where."""
     random = np.random.default_rng(seed)
     q, v, u = (random.uniform(-4, 4, (size, STATES)) for size in (model.nv, model.nv, model.nu))
-    program = emit(derive(model, symbols), len(symbols))
+    program = emit(derive(model, {entry: i for i, entry in enumerate(symbols)}), len(symbols))
     found = program.accelerations(program.lump(list(values)), list(q), list(v), list(u), np.sin, np.cos)
     return np.stack([a + 0 * q[0] for a in found]), (q, v, u)
 
@@ -75,7 +75,7 @@ def test_what_the_design_alone_decides_is_computed_once():
         mjcf(link("cart", 'type="slide" axis="1 0 0" damping="5"', pole), 'joint="cart"')
     )
     symbols = Entry("body_mass", 2), Entry("body_ipos", 2, 2)
-    program = emit(derive(model, symbols), 2)
+    program = emit(derive(model, {entry: i for i, entry in enumerate(symbols)}), 2)
     assert len(program.motion) <= 20
     assert {i.operation for i in program.motion} == {"+", "-", "*", "/", "sin", "cos"}
 

@@ -9,15 +9,15 @@ import numpy as np
 import pytest
 
 from rtcd_jax.evaluation import compare_with_mjx
-from rtcd_jax.plants.pendulum import Pendulum
 from rtcd_jax.run.reevaluation import physics_line, require_equal_physics
 from rtcd_jax.system.errors import UserError
 from tests import pipeline
+from tests.plants.robots import packaged
 
 STATES = 102
 
 
-class Heavier(Pendulum):
+class Heavier(type(packaged("pendulum"))):
     """Its MuJoCo model has `factor` times the mass of its equations."""
 
     factor: float = 1.0

@@ -3,8 +3,10 @@
 import jax
 import jax.numpy as jnp
 
-from rtcd_jax.plants.pendulum import PendulumDesign
 from rtcd_jax.types import Candidate, Evaluation, Funnel, Policy, Status, Trajectory, Volumes
+from tests.plants.robots import packaged
+
+PENDULUM = packaged("pendulum")
 
 N = 3
 
@@ -25,7 +27,7 @@ def evaluate_one(genome, volume, status):
         "push": volume / 100,
     }
     volumes = Volumes(volume * jnp.ones(N + 1), named)
-    candidate = Candidate(PendulumDesign(genome[0], genome[-1]), mark * jnp.ones(2), mark * jnp.ones(1))
+    candidate = Candidate(PENDULUM.Design(genome[0], genome[-1]), mark * jnp.ones(2), mark * jnp.ones(1))
     return Evaluation(genome, candidate, funnel, volumes, status)
 
 

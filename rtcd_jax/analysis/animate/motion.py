@@ -13,6 +13,7 @@ from rtcd_jax.elite.closed_loop import ClosedLoop, Dynamics, fastest_rate, runge
 from rtcd_jax.elite.elite import Elite
 from rtcd_jax.elite.funnel import FunnelInterpolant
 from rtcd_jax.elite.simulators import STEP_OF_FASTEST, STEPS
+from rtcd_jax.plants import model_of
 
 
 @final
@@ -54,7 +55,7 @@ def frame_times(elites: Sequence[Elite], hold: float, rate: float) -> Float[np.n
 
 def dynamics_before_mujoco(elite: Elite, starts: int) -> tuple[Any, Dynamics]:
     """The compiled model of the elite's design and its accelerations, for so many states at once."""
-    from rtcd_jax.plants.mjx import CpuDynamics, model_of
+    from rtcd_jax.plants.model import CpuDynamics
 
-    model = model_of(elite.plant, elite.parameters)
+    model = model_of(elite.robot, elite.parameters)
     return model, CpuDynamics(model, max(starts, elite.x_goal.size + elite.u_max.size, 2))

@@ -26,7 +26,7 @@ from rtcd_jax.elite.closed_loop import ARRIVED, FORGOTTEN, ClosedLoop, settling_
 from rtcd_jax.elite.elite import Elite, initial_and_best
 from rtcd_jax.elite.simulators import dynamics_of
 from rtcd_jax.export.rate import control_rate
-from rtcd_jax.plants import plant_class
+from rtcd_jax.plants import plant_of
 from rtcd_jax.plants.base import Plant
 from rtcd_jax.system.console import Clock, Console, Progress, times
 
@@ -99,7 +99,7 @@ def read_comparison(folder: Path, console: Console) -> Comparison:
 
 def comparison_of(elites: dict[str, Elite], config_hash: str | None) -> Comparison:
     """Elites of the same run, by name."""
-    robots = [plant_class(elite.plant).from_parameters(elite.parameters) for elite in elites.values()]
+    robots = [plant_of(elite.robot, elite.parameters, elite.design_units) for elite in elites.values()]
     dynamics = [dynamics_of(elite) for elite in elites.values()]
     rates = [ClosedLoop.of(elite, f).rates for elite, f in zip(elites.values(), dynamics, strict=True)]
     ends = [elite.time[-1] + settling_time(elite, f) for elite, f in zip(elites.values(), dynamics, strict=True)]

@@ -24,7 +24,6 @@ from rtcd_jax.analysis.disturb.scenarios import (
     STEP,
     Outcome,
     Rollouts,
-    motor_speeds,
     undisturbed,
 )
 from rtcd_jax.elite.closed_loop import ARRIVED
@@ -323,7 +322,9 @@ def _parameters(comparison: Comparison) -> Mapping[str, Callable[[Rollouts, np.n
     constants = [
         field.name
         for field in dataclasses.fields(comparison.plant)
-        if not field.metadata.get("static") and field.name != "gravity" and not field.name.endswith("_limit")
+        if field.name != "gravity"
+        and not field.name.endswith("_limit")
+        and np.any(getattr(comparison.plant, field.name))
     ]
     design = comparison.plant.design_units
     return {
@@ -338,7 +339,7 @@ def _motor_speeds(comparison: Comparison) -> np.ndarray:
     largest = []
     for index, elite in enumerate(comparison.elites):
         plant, design = jax.tree.map(lambda leaf, index=index: leaf[index], (comparison.plant, comparison.design))
-        largest.append(np.abs(motor_speeds(plant, design, jnp.asarray(elite.x.T))).max(axis=1))
+        largest.append(np.abs(plant.motor_speeds(design, jnp.asarray(elite.x.T))).max(axis=1))
     return np.max(largest, axis=0)
 
 

@@ -213,17 +213,9 @@ def _decide(loops: Loops, rollouts: Rollouts, motion: Motion, past, index, key, 
     return jnp.where(due, asked, motion.command), jnp.where(due, rollouts.input_noise * random[half:], motion.noise)
 
 
-def motor_speeds(plant: Plant, design: Any, x: Float[Array, "n L"]) -> Float[Array, "m L"]:
-    """v_i = dE/dx . B_i, by which an input u_i has the power u_i v_i."""
-    slope = jax.grad(lambda x: jnp.sum(plant.energy(design, x)))(x)
-    inputs = jnp.eye(plant.m)[:, :, None] * jnp.ones_like(x[0])
-    coasting = plant.dynamics(design, x, jnp.zeros_like(inputs[0]))
-    return jnp.stack([jnp.sum(slope * (plant.dynamics(design, x, u) - coasting), axis=0) for u in inputs])
-
-
 def _friction(rollouts: Rollouts, x: Float[Array, "n L"]) -> Float[Array, "m L"]:
     """Coulomb's, smoothed below the speeds `slips`."""
-    speeds = motor_speeds(rollouts.plant, rollouts.design, x)
+    speeds = rollouts.plant.motor_speeds(rollouts.design, x)
     return rollouts.friction * speeds / jnp.sqrt(speeds**2 + rollouts.slips**2)
 
 

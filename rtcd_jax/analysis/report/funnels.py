@@ -210,6 +210,6 @@ def _short_label(funnel: FunnelView) -> str:
 
 def _title(config: Config, funnel: FunnelView) -> str:
     record: Mapping[str, Any] = funnel.elite.record
-    design = [listed(name, value, config.plant.design[name]) for name, value in record["design"].items()]
+    design = [listed(name, value, config.design_units[name]) for name, value in record["design"].items()]
     weights = [listed(name, value) for name, value in record["weights"].items()]
     return "\n".join([funnel.label, ", ".join(design), ", ".join(weights)])

@@ -46,8 +46,8 @@ def failures(generations: Generations) -> dict[str, Float[np.ndarray, " generati
 def searched(config: Config) -> dict[str, tuple[Variable, str]]:
     """The free variables by their dotted names, in the order of the genome, with what they are called and units."""
     plant = config.plant
-    titles = {f"design.{name}": f"{words(name)} [{unit}]" for name, unit in plant.design.items()}
-    for sign, named in (("q", plant.states), ("r", plant.inputs)):
+    titles = {f"design.{name}": f"{words(name)} [{unit}]" for name, unit in config.design_units.items()}
+    for sign, named in (("q", plant.states), ("r", plant.input_units)):
         for i, (name, unit) in enumerate(named.items()):
             titles[f"weights.{sign}.{i}"] = f"{sign}{i + 1} of {letter(name)} [1/(s {_squared(unit)})]"
     titles |= {f"policy.{name}": title for name, title in OPTIONS.items()}

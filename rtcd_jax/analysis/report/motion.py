@@ -33,7 +33,7 @@ def motion(config: Config, funnels: Sequence[FunnelView]) -> Chart:
     ]
     inputs = [
         Panel(f"{name} [{unit}],\nlimit dashed", [*_limits(funnels, j), *(_input(funnel, j) for funnel in funnels)])
-        for j, (name, unit) in enumerate(config.plant.inputs.items())
+        for j, (name, unit) in enumerate(config.plant.input_units.items())
     ]
     ratios = [
         Curve(funnel.elite.time, boundary_ratio(funnel.elite), funnel.label, funnel.color, style="marked")
@@ -52,7 +52,7 @@ def motion(config: Config, funnels: Sequence[FunnelView]) -> Chart:
 def gains(config: Config, funnels: Sequence[FunnelView]) -> Chart:
     """K(t), entry by entry."""
     panels = []
-    for j, (input_, unit) in enumerate(config.plant.inputs.items()):
+    for j, (input_, unit) in enumerate(config.plant.input_units.items()):
         for i, (state, per) in enumerate(config.plant.states.items()):
             curves = [Curve(f.elite.time, f.elite.K[:, j, i], f.label, f.color) for f in funnels]
             per = f"({per})" if "/" in per else per

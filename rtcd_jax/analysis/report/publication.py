@@ -84,7 +84,7 @@ def _equal_but_for_the_seed(first: Config, second: Config) -> bool:
 
 def _initial(run: Run) -> str:
     values = {name: variable.initial for name, variable in run.config.design.items()}
-    design = [listed(name, value, run.config.plant.design[name]) for name, value in values.items()]
+    design = [listed(name, value, run.config.design_units[name]) for name, value in values.items()]
     weights = [listed(letter, [variable.initial for variable in found]) for letter, found in run.config.weights]
     return ", ".join([*design, *weights])
 

@@ -36,9 +36,9 @@ def gains(runs: Sequence[Run]) -> Table:
 
 def comparison(runs: Sequence[Run]) -> Table:
     """One row a run: what it searched, its best candidate, with whose proof."""
-    plant = runs[0].config.plant
+    units = runs[0].config.design_units
     heads = (
-        "run", "searched", *(f"{words(name)} [{unit}]" for name, unit in plant.design.items()),
+        "run", "searched", *(f"{words(name)} [{unit}]" for name, unit in units.items()),
         *_weight_heads(runs[0]), *(OPTIONS[name] for name in _searched_options(runs)), *map(words, VOLUMES),
         "sum × initial", "guarantee", "sum shown", "guarantee shown", "promise",
         "time",
@@ -48,7 +48,7 @@ def comparison(runs: Sequence[Run]) -> Table:
 
 def elites(run: Run) -> Table:
     """The archive, best first."""
-    plant, options = run.config.plant, _searched_options([run])
+    units, options = run.config.design_units, _searched_options([run])
     shown = {
         name: (certificate.shown["sum"], certificate.guarantee)
         for name, certificate in run.certificates.items()
@@ -56,7 +56,7 @@ def elites(run: Run) -> Table:
     }
     varied, compared = (any(record.get(key) for record in run.elites.values()) for key in ("spread", "mjx"))
     heads = (
-        "elite", *(f"{words(name)} [{unit}]" for name, unit in plant.design.items()), *_weight_heads(run),
+        "elite", *(f"{words(name)} [{unit}]" for name, unit in units.items()), *_weight_heads(run),
         *(OPTIONS[name] for name in options),
         *(f"{words(name)} [{volume_unit(run.config, name)}]" for name in VOLUMES), "sum × initial",
         "largest knot [%]", "swing-up [s]", "ε", "guarantee", *(["spread of sum [%]"] if varied else []),
@@ -163,7 +163,7 @@ def provenance(runs: Sequence[Run]) -> Table:
 def candidate(run: Run) -> str:
     """The best candidate's design, weights and searched options."""
     record = run.best.record
-    design = [listed(name, value, run.config.plant.design[name]) for name, value in record["design"].items()]
+    design = [listed(name, value, run.config.design_units[name]) for name, value in record["design"].items()]
     weights = [listed(name, value) for name, value in record["weights"].items()]
     options = [listed(name, record["policy"][name]) for name in run.config.policy.variables()]
     return ", ".join([*design, *weights, *options])

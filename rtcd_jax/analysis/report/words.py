@@ -45,7 +45,7 @@ def volume_unit(config: Config, volume: str = "sum") -> str:
     A push has the unit of an input times a second.
     """
     if VOLUMES[volume].push:
-        return "·".join([*next(iter(config.plant.inputs.values())).split(), "s"])
+        return "·".join([*next(iter(config.plant.input_units.values())).split(), "s"])
     powers = Counter({"s": VOLUMES[volume].seconds})
     for unit in config.plant.states.values():
         above, _, below = unit.partition("/")

@@ -18,7 +18,7 @@ from rtcd_jax.elite.elite import Elite
 from rtcd_jax.elite.records import elite_name, read_config
 from rtcd_jax.evaluation import elite_key, search_budget
 from rtcd_jax.funnel import estimate_funnel
-from rtcd_jax.plants import plant_class
+from rtcd_jax.plants import plant_of
 from rtcd_jax.policy import input_jumps
 from rtcd_jax.problem import Problem, make_problem
 from rtcd_jax.system.console import Clock, Console, Progress, duration, table
@@ -128,7 +128,7 @@ def _program(problem: Problem, elite: Elite) -> Callable[[Uncertainty], tuple[Ar
 
 def _policy(problem: Problem, elite: Elite) -> tuple[Candidate, Policy]:
     """The stored candidate and its policy, as a run has them."""
-    _, design = plant_class(elite.plant).from_parameters(elite.parameters)
+    _, design = plant_of(elite.robot, elite.parameters, elite.design_units)
     searched = {name: jnp.asarray(elite.policy[name], float) for name in problem.config.policy.variables()}
     candidate = Candidate(design, jnp.diag(jnp.asarray(elite.Q)), jnp.diag(jnp.asarray(elite.R)), searched)
     zero, none = jnp.zeros(()), jnp.zeros((), jnp.int32)

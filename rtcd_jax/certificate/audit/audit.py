@@ -16,7 +16,7 @@ from rtcd_jax.certificate.audit.folder import config_of, write_folder
 from rtcd_jax.certificate.audit.projection import defects, projected, with_fitting_inputs
 from rtcd_jax.elite.closed_loop import ClosedLoop, runge_kutta
 from rtcd_jax.elite.elite import Elite
-from rtcd_jax.elite.simulators import CLOSED_FORMS
+from rtcd_jax.elite.simulators import dynamics_of
 from rtcd_jax.system.console import Console, table
 from rtcd_jax.system.errors import UserError
 from rtcd_jax.system.files import make_folder, replace_json, require_own_folder
@@ -43,7 +43,7 @@ class Escapes(NamedTuple):
 
 def escapes(elite: Elite, states: int, seed: int) -> Escapes:
     """What `states` uniform random states of every ellipsoid do."""
-    f, intervals = CLOSED_FORMS[elite.plant](elite.parameters), len(elite.u)
+    f, intervals = dynamics_of(elite), len(elite.u)
     loop = ClosedLoop.of(elite, f)
     knots, x = elite.sample(states * (intervals + 1), np.random.default_rng(seed))
     level, next_level, now = np.zeros(len(x)), np.zeros(len(x)), np.zeros(len(x))

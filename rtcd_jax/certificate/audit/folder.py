@@ -66,7 +66,13 @@ def units(config: Config) -> dict[str, Any]:
     """Units as a run's records have them."""
     plant = config.plant
     volume = " ".join(plant.states.values())
-    return {"states": plant.states, "inputs": plant.inputs, "design": plant.design, "time": "s", "volume": volume}
+    return {
+        "states": plant.states,
+        "inputs": plant.input_units,
+        "design": config.design_units,
+        "time": "s",
+        "volume": volume,
+    }
 
 
 def _searched(value: float) -> dict[str, Any]:

@@ -17,7 +17,8 @@ from numpy.linalg import LinAlgError
 
 from rtcd_jax.certificate import check
 from rtcd_jax.certificate.check import Node, Refused, Undecided
-from rtcd_jax.elite.simulators import CLOSED_FORMS
+from rtcd_jax.config.plants import stored_plant
+from rtcd_jax.plants import dynamics_of
 from rtcd_jax.system.errors import UserError
 
 REPEATED = 16
@@ -81,7 +82,8 @@ class Motions:
         check.require(len(intervals) > 0, "funnel", "has no intervals")
         name = content["claim"]["plant"]
         self.plant, self.n, self.dt, self.limit = name, claim.n, float(claim.dt), float(claim.limit)
-        self._rate = CLOSED_FORMS[name]({key: float(value) for key, value in claim.parameters.items()})
+        parameters = {key: float(value) for key, value in claim.parameters.items()}
+        self._rate = dynamics_of(stored_plant(name), parameters, 0)
         self._x, self._rates, self._u, self._gains = map(_floats, (claim.x, claim.rates, claim.u, claim.K))
         self._goal, self._goal_gain = _floats(claim.x_goal), _floats(claim.K_goal)
         self._bounds = np.array([np.inf if b is None else float(b) for b in claim.bounds])

@@ -8,9 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from rtcd_jax.analysis.disturb.scenarios import CHUNK, STEP, Loops, advance, motor_speeds, start, undisturbed
+from rtcd_jax.analysis.disturb.scenarios import CHUNK, STEP, Loops, advance, start, undisturbed
 from rtcd_jax.elite.closed_loop import ClosedLoop, runge_kutta
-from rtcd_jax.elite.simulators import CLOSED_FORMS
+from tests.plants.robots import BY_HAND, ENERGIES
 
 COUNT = 512
 """Rollouts of every test, so that they share a program."""
@@ -44,7 +44,7 @@ def with_law(comparison, **changes):
 
 def test_the_law_is_that_of_the_verifications_loop(robots):
     random = np.random.default_rng(0)
-    f = CLOSED_FORMS[robots.elites[0].plant](robots.elites[0].parameters)
+    f = BY_HAND[robots.elites[0].plant](robots.elites[0].parameters)
     last = robots.elites[0].time[-1]
     for t in [*random.uniform(0, 1.3 * last, 30), 0.0, last]:
         x = robots.elites[0].x_goal + 0.1 * random.normal(size=(2, robots.plant.n))
@@ -58,7 +58,7 @@ def test_the_law_is_that_of_the_verifications_loop(robots):
 def test_undisturbed_motions_are_the_verifications_up_to_the_hold(robots):
     """Deviations from the motion that starts on x*: holding the input lags the loop by half a step, here below 1 %."""
     elite = robots.elites[0]
-    f = CLOSED_FORMS[elite.plant](elite.parameters)
+    f = BY_HAND[elite.plant](elite.parameters)
     loop = ClosedLoop.of(elite, f)
     offsets = 0.02 * np.random.default_rng(1).normal(size=(8, robots.plant.n))
     offsets[0] = 0
@@ -82,11 +82,12 @@ def test_dry_friction_takes_its_force_times_the_path_of_the_motor(robots):
         free = eqx.tree_at(lambda r, name=name: getattr(r.plant, name), free, jnp.zeros(COUNT))
     force = 0.05 * robots.elites[0].u_max[0]
     rubbed = dataclasses.replace(free, friction=jnp.full((1, COUNT), force), slips=jnp.full((1, COUNT), 1e-3))
-    np.testing.assert_allclose(motor_speeds(free.plant, free.design, free.x)[0], free.x[robots.plant.n // 2], rtol=1e-9)
+    np.testing.assert_allclose(free.plant.motor_speeds(free.design, free.x)[0], free.x[robots.plant.n // 2], rtol=1e-9)
     ends = [moved(off, each).x[:, :2] for each in (free, rubbed)]
-    design = jax.tree.map(lambda leaf: leaf[:2], free.design)
-    plant = jax.tree.map(lambda leaf: leaf[:2], free.plant)
-    before, kept, after = (np.asarray(plant.energy(design, jnp.asarray(state))) for state in (x.T, *ends))
+    energies = [ENERGIES[elite.plant](elite.parameters) for elite in robots.elites]
+    before, kept, after = (
+        np.array([energy(state[:, i]) for i, energy in enumerate(energies)]) for state in (x.T, *map(np.asarray, ends))
+    )
     np.testing.assert_allclose(kept, before, rtol=1e-6)
     assert np.all(np.abs(ends[1][0]) > 0.1)
     np.testing.assert_allclose(before - after, force * np.abs(ends[1][0]), rtol=2e-3)
@@ -99,8 +100,8 @@ def _oracle(comparison, index, x, seconds, *, actuator_scale, period, delay, lag
     parameters = elite.parameters | {first: elite.parameters[first] * scale}
     if elite.plant == "cartpole":
         parameters["inertia_about_com"] = parameters["Mp"] * parameters["lp"] ** 2 / 3
-    f = CLOSED_FORMS[elite.plant](parameters)
-    known = ClosedLoop.of(elite, CLOSED_FORMS[elite.plant](elite.parameters))
+    f = BY_HAND[elite.plant](parameters)
+    known = ClosedLoop.of(elite, BY_HAND[elite.plant](elite.parameters))
     past, given, command = [x], 0.0, 0.0
     for i in range(round(seconds / STEP)):
         t = i * STEP

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from rtcd_jax.analysis.replay.measured import read_measured
-from rtcd_jax.config.schema import PLANTS
+from rtcd_jax.config.plants import PLANTS
 from rtcd_jax.system.errors import UserError
 
-PENDULUM, CARTPOLE = PLANTS["pendulum"].states, PLANTS["cartpole"].states
+PENDULUM, CARTPOLE = PLANTS["pendulum"]().states, PLANTS["cartpole"]().states
 TIME = [0.0, 0.5, 1.0]
 ANGLE, SPEED = [3.0, -2.5, 0.25], [0.0, 12.5, -1.0]
 CART, CART_SPEED = [0.1, -0.2, 0.0], [1.5, 0.0, -3.0]

@@ -8,7 +8,7 @@ import pytest
 
 from rtcd_jax.analysis.replay.measured import jumps, read_measured
 from rtcd_jax.analysis.replay.replay import replay_run
-from rtcd_jax.config.schema import PLANTS
+from rtcd_jax.config.plants import PLANTS
 from rtcd_jax.elite.elite import Elite
 from rtcd_jax.elite.funnel import FunnelInterpolant
 from rtcd_jax.elite.records import write_elite
@@ -16,7 +16,7 @@ from rtcd_jax.system.errors import UserError
 from tests.analysis.report.loops import LOOPS, loop_folder, stored
 from tests.consoles import Output
 
-STATES = {name: plant.states for name, plant in PLANTS.items()}
+STATES = {name: plant().states for name, plant in PLANTS.items()}
 HEADS = {"pendulum": "time,pos,vel,torque", "cartpole": "time,pos1,pos2,vel1,vel2,tau1,tau2"}
 
 

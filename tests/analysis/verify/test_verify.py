@@ -15,11 +15,12 @@ from scipy.linalg import solve_continuous_are
 
 from rtcd_jax.analysis.verify.run import verify_run
 from rtcd_jax.analysis.verify.verification import Trial, Verification
+from rtcd_jax.config.plants import stored_plant
 from rtcd_jax.elite.closed_loop import ClosedLoop, simulate
 from rtcd_jax.elite.elite import Elite
 from rtcd_jax.elite.records import write_elite
 from rtcd_jax.elite.simulators import simulators_of
-from rtcd_jax.plants.mjx import model_of
+from rtcd_jax.plants import model_of
 from rtcd_jax.system.errors import UserError
 from tests.consoles import Screen, Stopped
 
@@ -160,7 +161,7 @@ def test_mujocos_own_steps_with_held_inputs_converge_to_the_loop():
     elite, x0 = _held(HELD), np.array([np.pi + 0.1, -0.2])
 
     def stepped(steps):
-        model = model_of("pendulum", PARAMETERS)
+        model = model_of(stored_plant("pendulum"), PARAMETERS)
         model.opt.timestep = 0.05 / steps
         data = mujoco.MjData(model)
         data.qpos, data.qvel = x0[:1], x0[1:]
