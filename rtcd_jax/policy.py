@@ -103,6 +103,21 @@ def stabilize(problem: Problem, candidate: Candidate, trajectory: Trajectory) ->
     return Policy(trajectory, jnp.moveaxis(gains, -1, 0), values, first_failure(trajectory.status, status))
 
 
+def value_rates(problem: Problem, candidate: Candidate, policy: Policy) -> Float[Array, "intervals 2 n n"]:
+    """S' at both ends of every interval: the policy's own, or -(A'S + S A - S B R^-1 B' S + Q)."""
+    if policy.value_rates is not None:
+        return policy.value_rates
+    xs, us = policy.trajectory.xs.T, policy.trajectory.us.T
+    values = jnp.moveaxis(policy.values, 0, -1)
+    states, s = (jnp.stack([each[..., :-1], each[..., 1:]], -1) for each in (xs, values))
+    inputs = jnp.broadcast_to(us[..., None], (*us.shape, 2))
+    a, b = _discounted(problem, candidate, *linearize(problem, candidate, states, inputs))
+    gain = mm(s, b)
+    square = mm(gain / input_weights(problem, candidate, inputs)[None], transpose(gain))
+    q = jnp.diag(candidate.q)[:, :, None, None]
+    return jnp.moveaxis(square - mm(transpose(a), s) - mm(s, a) - q, (2, 3), (0, 1))
+
+
 def goal_value(problem: Problem, candidate: Candidate) -> tuple[Float[Array, "n n"], Bool[Array, ""]]:
     """S of the goal's infinite-horizon LQR, and whether it exists."""
     goal = jnp.asarray(problem.goal, candidate.q.dtype)

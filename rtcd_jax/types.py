@@ -97,13 +97,15 @@ class Trajectory(eqx.Module):
 class Policy(eqx.Module):
     """u = clip(u*(t) - K(t) (x - x*(t))) about a trajectory; the last gain is the goal's own LQR.
 
-    `values` are S(t_k) of the continuous Riccati equation; V_k(x) = (x - x*_k)' S_k (x - x*_k).
+    `values` are S(t_k) of the continuous Riccati equation, or of a refinement; V_k(x) = (x - x*_k)' S_k (x - x*_k).
+    `value_rates` are S' at both ends of every interval where no Riccati equation says them.
     """
 
     trajectory: Trajectory
     gains: Float[Array, "*batch knots m n"]
     values: Float[Array, "*batch knots n n"]
     status: Int[Array, "*batch"]
+    value_rates: Float[Array, "*batch intervals 2 n n"] | None = None
 
 
 class Funnel(eqx.Module):

@@ -15,7 +15,18 @@ LAYERS = (
     {"types", "volume"},  # the nouns, and the list of volumes that a configuration names
     {"config"},
     {"plants"},
-    {"problem", "genome", "trajectory", "policy", "adversary", "rollout", "validation", "funnel", "evaluation"},
+    {
+        "problem",
+        "genome",
+        "trajectory",
+        "policy",
+        "adversary",
+        "rollout",
+        "validation",
+        "funnel",
+        "evaluation",
+        "refinement",
+    },
     {"search", "elite"},
     {"run"},
     {"analysis", "certificate", "export"},
@@ -26,7 +37,7 @@ LAYERS = (
 # The steps of the algorithm: each imports from those before it.
 STEPS = (
     "types", "problem", "genome", "trajectory", "policy", "adversary", "rollout", "validation", "funnel", "volume",
-    "evaluation",
+    "evaluation", "refinement",
 )  # fmt: skip
 
 # Packages that only some modules may import.
@@ -37,6 +48,7 @@ OWNERS = {
     "flint": {"certificate"},
     "orbax": {"run"},
     "evosax": {"search"},
+    "optax": {"refinement"},
     "rich": {"system.console"},
     "tyro": {"cli"},
     "yaml": {"config", "export"},

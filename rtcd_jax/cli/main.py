@@ -68,6 +68,12 @@ VERBS = {
         "rtcd_jax.cli.search_verbs:sweep", "make all the runs that a YAML's sweep section asks for, or one of them"
     ),
     "scale": Verb("rtcd_jax.cli.search_verbs:scale", "measure what a generation costs against population and devices"),
+    "refine": Verb(
+        "rtcd_jax.cli.run_verbs:refine",
+        "refine gains and ellipsoids of a run's elites by gradients, under the run's uncertainty",
+        jax=True,
+        shown=True,
+    ),
     "verify": Verb(
         "rtcd_jax.cli.run_verbs:verify",
         "simulate held-out states of a run's funnels with independent simulators",

@@ -60,10 +60,12 @@ FLAT = tyro.conf.arg(name="")
 """Of a field that is a model itself: its options have no prefix."""
 
 
-def shown(metavar: str | None = None, otherwise: str | None = None) -> Any:
-    """How help shows an option: its value, and what holds where it is left away, in place of `(default: None)`."""
+def shown(metavar: str | None = None, otherwise: str | None = None, name: str | None = None) -> Any:
+    """How help shows an option: its value, what holds where it is left away, in place of `(default: None)`, and its
+    name where that is no name in Python.
+    """
     hint = f"(default: {otherwise})" if otherwise else None
-    return tyro.conf.arg(metavar=metavar, help_behavior_hint=hint)
+    return tyro.conf.arg(name=name, metavar=metavar, help_behavior_hint=hint)
 
 
 Cache = Annotated[str | None, shown("DIR", "~/.cache/rtcd_jax/xla")]

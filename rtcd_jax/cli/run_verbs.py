@@ -12,6 +12,7 @@ from pydantic import AfterValidator, Field
 
 from rtcd_jax.cli.exits import Exit
 from rtcd_jax.cli.options import Cache, Elite, ExistingRun, Options, Positional, Run, shown
+from rtcd_jax.config.schema import REFINABLE, REFINEMENT_STEPS
 from rtcd_jax.config.settings import refusal
 from rtcd_jax.system.console import Console, silent
 from rtcd_jax.system.devices import cores
@@ -243,6 +244,41 @@ def export(options: ExportOptions, console: Console) -> Exit:
     from rtcd_jax.export import export_run
 
     export_run(options.run, options.elite, options.to, console, options.name)
+    return Exit.OK
+
+
+def _refinable(text: str) -> str:
+    """A list of what can be refined, split by commas."""
+    wrong = [name for name in text.split(",") if name not in REFINABLE]
+    if wrong:
+        raise refusal(f"must be one or more of {', '.join(REFINABLE)}, split by commas")
+    return text
+
+
+class RefineOptions(Options):
+    """Refine gains and ellipsoids' shapes of a run's best elites by gradients, so that the funnels under the run's
+    uncertainty grow.
+
+    A refined elite takes its place among the others only where the elites' own estimator finds the run's objective
+    larger; what was replaced stays in unrefined/. The same command goes on after a stop.
+
+    Example: rtcd refine checkpoints/pendulum_robust --elites 4
+    """
+
+    run: Run = Field(description="the run folder")
+    elites: int = Field(default=1, description="how many, the best first [-]", ge=1)
+    free: Annotated[str, AfterValidator(_refinable), shown("NAME,NAME")] = Field(
+        default="gains,shapes", description="what is refined"
+    )
+    steps: int = Field(default=REFINEMENT_STEPS, description="of the optimizer [-]", ge=1, le=1_000_000)
+    cache: Cache = Field(default=None, description="of compiled programs, '' for none")
+
+
+def refine(options: RefineOptions, console: Console) -> Exit:
+    from rtcd_jax.run.refine import refine_run
+
+    free = tuple(name for name in REFINABLE if name in options.free.split(","))
+    refine_run(options.run, options.elites, free, options.steps, console)
     return Exit.OK
 
 

@@ -9,7 +9,7 @@ from pydantic import AfterValidator, Field, PlainValidator
 
 from rtcd_jax.cli.config_options import config_branch
 from rtcd_jax.cli.exits import Exit, say
-from rtcd_jax.cli.options import FLAT, OPTIMIZE_USAGE, Cache, Options, Positional, shown
+from rtcd_jax.cli.options import FLAT, OPTIMIZE_USAGE, Cache, ExistingRun, Options, Positional, shown
 from rtcd_jax.config.load import EXAMPLE, Config, load, parse, parse_yaml
 from rtcd_jax.config.packaged import config_path, listing, packaged
 from rtcd_jax.config.schema import SMALLEST_POPULATION
@@ -107,10 +107,14 @@ class OptimizeOptions(Options):
 
     Example: rtcd optimize pendulum_rtcd --run checkpoints/mine --search.population 512
     Example: rtcd optimize configs/pendulum_rtcd.yaml
+    Example: rtcd optimize pendulum_robust --from checkpoints/pendulum_rtcd
     """
 
     file: _ConfigPath = Field(description=_EXPERIMENT)
     config: Annotated[Config, PlainValidator(_configuration), FLAT]
+    former: Annotated[ExistingRun | None, shown("RUN", "the file's initial values", name="from")] = Field(
+        default=None, description="finished run of this robot, with whose best candidate the search begins"
+    )
     run: Annotated[Path, shown("FOLDER")] = Field(description="run folder, resumed if it is there")
     dry: bool = Field(default=False, description="only say what is understood of the robot and its task")
     machines: Annotated[Machines, FLAT] = Machines()
@@ -128,19 +132,24 @@ class OptimizeOptions(Options):
 
 def optimize(options: OptimizeOptions, console: Console) -> Exit:
     """Searches, and makes the run's page."""
+    config = options.config
+    if options.former is not None:
+        from rtcd_jax.elite.warm_start import begun_from
+
+        config = begun_from(config, options.former)
     if options.dry:
         prepare_jax(cache=options.machines.cache)
         from rtcd_jax.problem import make_problem
         from rtcd_jax.run.dry import understood
 
-        for line in understood(make_problem(options.config)):
+        for line in understood(make_problem(config)):
             console.message(line)
         return Exit.OK
 
     def search(console: Console, cluster: "Cluster") -> None:
         from rtcd_jax.run.optimize import optimize as run_optimize
 
-        worked = run_optimize(options.config, options.run, console, cluster)
+        worked = run_optimize(config, options.run, console, cluster)
         finish = partial(_finish_page, options.run, worked, console)
         cluster.on_first(partial(cluster.heeding, finish))
 

@@ -49,6 +49,8 @@ weights:
 """The shortest complete YAML: the paper's pendulum with the default settings."""
 
 SMALLEST_DESIGN, SMALLEST_WEIGHT = 1e-6, 1e-9
+LATER_KEYS = ("refine", "patience")
+"""Of `search`, whose defaults leave the hashes of configurations as they were before there were such keys."""
 
 
 class Config(Settings):
@@ -310,6 +312,9 @@ def config_hash(config: Config) -> str:
         del stated["search"]["at_least"]
     if config.trajectory.input_share == 1:
         del stated["trajectory"]["input_share"]
+    for key in LATER_KEYS:
+        if getattr(config.search, key) == SearchConfig.model_fields[key].default:
+            del stated["search"][key]
     canonical = json.dumps(stated, sort_keys=True, separators=(",", ":"))
     return hashlib.sha256(canonical.encode()).hexdigest()[:12]
 

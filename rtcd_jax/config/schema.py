@@ -319,6 +319,12 @@ else:
     Objective = Literal[tuple(VOLUMES)]
 
 
+REFINABLE = ("gains", "shapes")
+"""What an elite's refinement may move."""
+REFINEMENT_STEPS = 400
+"""Of its optimizer."""
+
+
 class SearchConfig(Settings):
     objective: Objective = Field(default="sum", description="volume to maximize")
     at_least: dict[str, Annotated[float, Field(gt=0, le=1e12)]] = Field(
@@ -335,10 +341,20 @@ class SearchConfig(Settings):
         le=1_000_000,
         description="generations; each evaluates the whole population, also when nested [-]",
     )
+    patience: int = Field(
+        default=10,
+        ge=0,
+        le=1_000_000,
+        description="(outer) generations without 0.1 % of gain after which the search ends; 0: never [-]",
+    )
     sigma: float = Field(default=0.3, ge=1e-6, le=1, description="initial step size in the unit box [-]")
     seed: int = Field(default=0, ge=0, lt=2**32, description="of all random numbers [-]")
     chunk: Annotated[int, Field(ge=1, le=2**20)] | Literal["auto"] = Field(
         default="auto", description="candidates that a device is given at once; auto: as many as its memory holds [-]"
+    )
+    refine: bool = Field(
+        default=False,
+        description="refine gains and ellipsoids of the elites by gradients at the end, as `rtcd refine` does",
     )
     nested: NestedConfig = Field(
         default=NestedConfig(), description="budget of the two loops, used in mode nested alone"

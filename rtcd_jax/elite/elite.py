@@ -37,7 +37,8 @@ class Elite:
     Promised with `confidence`: a state, uniform in its ellipsoid B_k = {x : V_k(x) <= rho_k}, fails with a
     probability of at most `epsilon`. `guarantee` says on what ground; a claimed funnel promises that no state fails.
     `volumes` are the funnel's, by name, `pushes` the largest impulse on each input at each knot that leaves x* + B J in
-    the funnel (None in files that lack it), and `record` is all of `NNN.json`.
+    the funnel (None in files that lack it), `S_rates` are S' at both ends of every interval where S is no Riccati
+    equation's, and `record` is all of `NNN.json`.
 
     Raises:
         UserError: shapes that do not belong together, or no funnel: a level or an S that is not positive.
@@ -64,6 +65,7 @@ class Elite:
     volumes: Mapping[str, float] = field(default_factory=dict)
     pushes: Float[np.ndarray, "knots m"] | None = None
     record: Mapping[str, Any] = field(default_factory=dict)
+    S_rates: Float[np.ndarray, "intervals 2 n n"] | None = None
 
     def __post_init__(self):
         knots, n, m = self.time.size, self.x_goal.size, self.u_max.size
@@ -74,6 +76,8 @@ class Elite:
         }  # fmt: skip
         if self.pushes is not None:
             shapes["pushes"] = (knots, m)
+        if self.S_rates is not None:
+            shapes["S_rates"] = knots - 1, 2, n, n
         wrong = [f"{name} {getattr(self, name).shape}" for name in shapes if getattr(self, name).shape != shapes[name]]
         if wrong:
             raise UserError(
@@ -113,7 +117,7 @@ class Elite:
         }
         fields: dict[str, Any] = {**named, **numbers, "volumes": volumes, "record": record}
         stored = {"guarantee": "rung"}  # the field's key in NNN.json
-        needed = [name for name in cls.__dataclass_fields__ if name != "pushes"]
+        needed = [name for name in cls.__dataclass_fields__ if name not in ("pushes", "S_rates")]
         missing = [stored.get(name, name) for name in needed if fields.get(name) is None]
         if missing:
             raise UserError(f"the elite lacks {', '.join(missing)}")

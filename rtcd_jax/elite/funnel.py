@@ -3,7 +3,7 @@
 On [t_k, t_k+1], s = (t - t_k) / (t_k+1 - t_k):
 
     x*(t)    the cubic Hermite interpolant of x_k, f(x_k, u_k) and x_k+1, f(x_k+1, u_k)
-    S(t)     that of S_k and S_k+1 with the slopes of the policy's Riccati equation there
+    S(t)     that of S_k and S_k+1 with the slopes of the policy's Riccati equation there, or a refinement's
     rho(t)   rho_k^(1 - s) rho_k+1^s
 
 After t_N the goal, its LQR's S_N, and rho_N. Errors x - x*(t) of angles are not wrapped. What was sampled is promised
@@ -95,11 +95,13 @@ def linearized(
 def value_rates(
     elite: Elite, a: Float[np.ndarray, "intervals 2 n n"], b: Float[np.ndarray, "intervals 2 n m"]
 ) -> Float[np.ndarray, "intervals 2 n n"]:
-    """S' at both ends of every interval by the policy's own Riccati equation, from A and B there.
+    """S' at both ends of every interval: the elite's, or by the policy's own Riccati equation, from A and B there.
 
     The options are those of `rtcd_jax.policy`: A is A + discount I, and R is R input_weight / max(1 - |u*| / u_max,
     authority)^2.
     """
+    if elite.S_rates is not None:
+        return elite.S_rates
     options = elite.policy
     left = np.maximum(1 - np.abs(elite.u) / elite.u_max, options.get("authority", 1.0))
     weights = options.get("input_weight", 1.0) * np.diag(elite.R) / left**2

@@ -259,7 +259,7 @@ def _prepared(path: Path, config: Config, notes: list[str]) -> Iterator[None]:
     _mend_mark(path, notes)
     require_own_folder(path, "a run", (path / "format.json").is_file(), {_LOCK})
     make_folder(path)
-    with _locked(path):
+    with locked(path):
         with writing(path):
             for leftover in path.rglob(".*.tmp"):
                 leftover.unlink()
@@ -320,7 +320,7 @@ def _add_start(path: Path, config: Config) -> None:
 
 
 @contextlib.contextmanager
-def _locked(path: Path) -> Iterator[None]:
+def locked(path: Path) -> Iterator[None]:
     """Holds the folder for this process; the system frees it when the process ends, however it ends."""
     with contextlib.ExitStack() as stack:
         with writing(path):

@@ -1,20 +1,22 @@
 """Evaluation -> the stable result format of `elites/NNN.npz` and `NNN.json`, which others read."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from rtcd_jax.config.load import config_hash
 from rtcd_jax.config.plants import PLANTS
 from rtcd_jax.evaluation import elite_budget
+from rtcd_jax.genome import decode
 from rtcd_jax.numerics.proportion import failure_bound
 from rtcd_jax.policy import input_jumps, options
 from rtcd_jax.problem import Problem
-from rtcd_jax.types import Evaluation, Status
+from rtcd_jax.types import Evaluation, Funnel, Policy, Status, Trajectory
 from rtcd_jax.validation import PhysicsComparison
-from rtcd_jax.volume import VOLUMES, largest_pushes
+from rtcd_jax.volume import VOLUMES, funnel_volume, largest_pushes
 
 
 def arrays_of(problem: Problem, evaluation: Evaluation) -> dict[str, np.ndarray]:
@@ -22,12 +24,14 @@ def arrays_of(problem: Problem, evaluation: Evaluation) -> dict[str, np.ndarray]
     host = jax.tree.map(np.asarray, evaluation)
     policy, volumes = host.funnel.policy, host.volumes
     knots = len(policy.trajectory.xs)
+    rates = {} if policy.value_rates is None else {"S_rates": policy.value_rates}
     return {
         "time": policy.trajectory.dt * np.arange(knots),
         "x": policy.trajectory.xs,
         "u": policy.trajectory.us,
         "K": policy.gains,
         "S": policy.values,
+        **rates,
         "rho": host.funnel.levels,
         "trials": host.funnel.trials,
         "Q": np.diag(host.candidate.q),
@@ -42,21 +46,37 @@ def arrays_of(problem: Problem, evaluation: Evaluation) -> dict[str, np.ndarray]
     }
 
 
+def evaluation_of(problem: Problem, arrays: Mapping[str, np.ndarray], record: Mapping[str, Any]) -> Evaluation:
+    """The evaluation that `arrays_of` and `record_of` stored, of a candidate that has a funnel."""
+    trajectory, ok = record["trajectory"], np.int32(Status.OK)
+    path = arrays["u"], arrays["x"], arrays["time"][1]
+    motion = Trajectory(*path, *(np.asarray(trajectory[name]) for name in ("cost", "defect", "iterations")), ok)
+    policy = Policy(motion, arrays["K"], arrays["S"], ok, arrays.get("S_rates"))
+    borne = None if problem.uncertainty is None else np.ones(())
+    funnel = Funnel(policy, arrays["rho"], arrays["trials"], ok, borne)
+    candidate = jax.device_get(decode(problem, jnp.asarray(arrays["genome"])))
+    volumes = jax.device_get(funnel_volume(funnel, input_jumps(problem, candidate, motion)))
+    return Evaluation(arrays["genome"], candidate, funnel, volumes, ok)
+
+
 def record_of(
     problem: Problem,
     evaluation: Evaluation,
     others: Sequence[Evaluation] = (),
     physics: PhysicsComparison | None = None,
+    refinement: Mapping[str, Any] | None = None,
 ) -> dict[str, Any]:
     """What a human wants to read of one candidate, and what its numbers mean.
 
-    `others` are its evaluations under other keys, `physics` is MJX beside the closed form.
+    `others` are its evaluations under other keys, `physics` is MJX beside the closed form, `refinement` says what was
+    refined, and the volumes before.
     """
     budget = elite_budget(problem)
     host = jax.tree.map(np.asarray, evaluation)
     plant, config = problem.plant, problem.config
     funnel, volumes = host.funnel, host.volumes
     design = host.candidate.design
+    candidates = (1 if refinement is None else 2) * (config.elites.count + 1)  # what it was is one of them
     return {
         "plant": config.plant.name,
         **({} if config.plant.name in PLANTS else {"robot": config.plant.model_dump(mode="json")}),
@@ -74,7 +94,7 @@ def record_of(
         "state_limits": [limit if np.isfinite(limit) else None for limit in problem.state_limits.tolist()],
         "status": Status(int(host.status)).name,
         "rung": "sampled",
-        "epsilon": epsilon(funnel.trials, config.funnel.confidence, budget.rounds * (config.elites.count + 1)),
+        "epsilon": epsilon(funnel.trials, config.funnel.confidence, budget.rounds * candidates),
         "confidence": config.funnel.confidence,
         "uncertainty": None if config.uncertainty.empty else config.uncertainty.model_dump(),
         "samples": int(funnel.trials.min()),
@@ -92,6 +112,7 @@ def record_of(
         "followed_to_the_goal": bool(budget.samples_per_knot),
         "spread": _spread(others) if len(others) > 1 else None,
         "mjx": None if physics is None else dict(vars(jax.tree.map(np.asarray, physics))),
+        **({} if refinement is None else {"refinement": dict(refinement)}),
         "seed": config.search.seed,
         "config_hash": config_hash(config),
     }

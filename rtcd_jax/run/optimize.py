@@ -10,16 +10,19 @@ import jax.numpy as jnp
 import numpy as np
 
 from rtcd_jax.config.load import Config
-from rtcd_jax.elite.records import elite_names
+from rtcd_jax.config.schema import REFINABLE, REFINEMENT_STEPS
+from rtcd_jax.elite.records import Record, elite_names, read_generations
 from rtcd_jax.evaluation import device_chunk, make_evaluate
 from rtcd_jax.genome import initial_genome
 from rtcd_jax.problem import Problem, make_problem
+from rtcd_jax.refinement import Refinement
 from rtcd_jax.run.folder import RunFolder
 from rtcd_jax.run.format import arrays_of, record_of
 from rtcd_jax.run.reevaluation import Reevaluation, Reported, physics_line, row
+from rtcd_jax.run.refine import PARTIAL, PartialState, refine_elites
 from rtcd_jax.run.sharding import Sharded, sharded
 from rtcd_jax.search import search
-from rtcd_jax.search.archive import Elites, shortfall
+from rtcd_jax.search.archive import Elites, cost, shortfall
 from rtcd_jax.system.cluster import Cluster, Preempted
 from rtcd_jax.system.console import Clock, Console, Progress, times
 from rtcd_jax.system.errors import UserError
@@ -51,8 +54,10 @@ def optimize(config: Config, folder: Path, console: Console, cluster: Cluster) -
         for note in run.notes:
             console.message(note)
         done = int(begun.generation)
+        best = _best_so_far(folder, done, cluster)
+        over = done == config.search.generations or search.settled(config.search, best)
         whole = bool(cluster.agreed(np.asarray((folder / LAST_FILE).is_file())))
-        if done == config.search.generations and whole:
+        if over and whole:
             console.message(f"{folder} is complete: {done} generations, {len(elite_names(folder))} elites")
             return False
         if done:
@@ -63,7 +68,7 @@ def optimize(config: Config, folder: Path, console: Console, cluster: Cluster) -
         again = Reevaluation(problem, cluster, example, console)
         state, pace = begun, _Pace(config)
         try:
-            steps = search.run(plan, evaluate, begun)
+            steps = search.run(plan, evaluate, begun, best)
             for state, generation in iter(partial(cluster.heeding, partial(next, steps, None)), None):
                 run.append(vars(generation))
                 run.save_if_due(state, int(state.generation))
@@ -73,6 +78,8 @@ def optimize(config: Config, folder: Path, console: Console, cluster: Cluster) -
             run.save(state, int(state.generation))
             raise
         run.save(state, int(state.generation))
+        if int(state.generation) < config.search.generations:
+            console.message(f"no gain of {search.GAIN:.1%} in {config.search.patience} generations: the search is over")
         initial = cluster.heeding(partial(_initial, problem, evaluate))
         *sampled, initial = again.sample([*_filled(state.elites), initial])
         best_first = _filled(search.finish(plan, state, _stacked(sampled, state.elites)))
@@ -81,9 +88,28 @@ def optimize(config: Config, folder: Path, console: Console, cluster: Cluster) -
                 "none of the elites kept a funnel under more samples: raise funnel.directions or funnel.trials, "
                 "so that the search is not misled by luck"
             )
-        reported = again.report(best_first, initial)
-        cluster.on_first(lambda: _store(problem, *reported, run, console))
+        refinements: Sequence[Record | None] = [None] * len(best_first)
+        partial_state = PartialState(folder / PARTIAL, config.checkpoint.seconds, cluster)
+        if config.search.refine:
+            refinement = Refinement(problem, REFINEMENT_STEPS)
+            console.message(f"refining {len(best_first)} elites: compiling takes a minute or so")
+            pairs = refine_elites(refinement, best_first, REFINABLE, again, console, partial_state)
+            by_volume = sorted(pairs, key=lambda pair: float(cost(pair[0], config.search)))
+            best_first, refinements = zip(*by_volume, strict=True)
+        elites, reported = again.report(best_first, initial)
+        elites = [each._replace(refinement=record) for each, record in zip(elites, refinements, strict=True)]
+        cluster.on_first(lambda: _store(problem, elites, reported, run, console))
+        partial_state.close()
         return True
+
+
+def _best_so_far(folder: Path, done: int, cluster: Cluster) -> list[float]:
+    """The best volume after each of the generations that are done, as process 0 reads it; NaN where there is none."""
+    best = np.full(done, math.nan)
+    for line in read_generations(folder) if cluster.first else ():
+        if line["best_so_far"] is not None and line["index"] < done:
+            best[line["index"]] = line["best_so_far"]
+    return cluster.agreed(best).tolist()
 
 
 class _Pace:

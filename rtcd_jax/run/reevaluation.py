@@ -4,11 +4,12 @@ One fixed key in every run: a candidate has the same numbers in every run. Furth
 the best and of the initial candidate varies; MJX follows held-out samples of all of them to the goal as well.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from functools import partial
 from typing import Any, Generic, NamedTuple, TypeVar, final
 
+import equinox as eqx
 import jax
 import numpy as np
 
@@ -35,26 +36,33 @@ class Reported(NamedTuple):
     evaluation: Evaluation
     others: Sequence[Evaluation]
     physics: PhysicsComparison | None
+    refinement: Mapping[str, Any] | None = None
 
 
 @final
 class Reevaluation:
-    """Its programs compile beside the search's own, from when this is made."""
+    """Its programs compile beside the search's own, from when this is made. All methods raise Preempted.
+
+    Rollouts ask for S at the knots alone: a policy's `value_rates` are left out of the programs.
+    """
 
     def __init__(self, problem: Problem, cluster: Cluster, population: Evaluation, console: Console):
         self._elites, self._key = problem.config.elites, elite_key()
         self._cluster, self._console = cluster, console
         self._checks = problem.config.search.generations
         self._budget = elite_budget(problem)
+        population = _with_rates(population, None)
         self._resample = _OnDevices(partial(resample, problem, self._budget), cluster, population)
         if self._elites.mjx_states:
             compare = lambda evaluation, key, _: compare_with_mjx(problem, evaluation, key)  # noqa: E731
             self._compare = _OnDevices(compare, cluster, population)
 
     def sample(self, evaluations: Sequence[Evaluation]) -> list[Evaluation]:
-        """Each with its funnel sampled again, all by the same random numbers. Raises Preempted, as all methods."""
+        """Each with its funnel sampled again, all by the same random numbers."""
         jobs = [(evaluation, self._key, self._budget.samples_per_knot) for evaluation in evaluations]
-        return self._resample(jobs, self._tell("funnels sampled again", len(jobs)))
+        results = self._resample(jobs, self._tell("funnels sampled again", len(jobs)))
+        rates = [evaluation.funnel.policy.value_rates for evaluation in evaluations]
+        return [_with_rates(result, each) for result, each in zip(results, rates, strict=True)]
 
     def report(self, elites: Sequence[Evaluation], initial: Evaluation) -> tuple[list[Reported], Reported]:
         """What is stored of the elites, best first, and of the initial candidate.
@@ -63,13 +71,13 @@ class Reevaluation:
             UserError: MJX and the closed form differ.
         """
         candidates = [*elites, initial]
-        physics = self._compared(candidates)
+        physics = self.compared(candidates)
         others: list[Sequence[Evaluation]] = [[] for _ in candidates]
-        others[0], others[-1] = self._repeated([elites[0], initial])
+        others[0], others[-1] = self.repeated([elites[0], initial])
         *reported, last = map(Reported, candidates, others, physics)
         return reported, last
 
-    def _repeated(self, evaluations: Sequence[Evaluation]) -> list[list[Evaluation]]:
+    def repeated(self, evaluations: Sequence[Evaluation]) -> list[list[Evaluation]]:
         """Each under the further keys, with the held-out samples of the first rounds alone: by more of them the levels
         vary less, so that the spread is rather overestimated.
         """
@@ -79,8 +87,8 @@ class Reevaluation:
         results = self._resample(jobs, self._tell("funnels sampled by further keys", len(jobs)))
         return [results[k * count : (k + 1) * count] for k in range(len(evaluations))]
 
-    def _compared(self, evaluations: Sequence[Evaluation]) -> list[PhysicsComparison | None]:
-        """None for what has no funnel."""
+    def compared(self, evaluations: Sequence[Evaluation]) -> list[PhysicsComparison | None]:
+        """MJX beside the closed form; None for what has no funnel."""
         comparisons: list[PhysicsComparison | None] = [None] * len(evaluations)
         if not self._elites.mjx_states:
             return comparisons
@@ -92,10 +100,14 @@ class Reevaluation:
             comparisons[k] = comparison
         return comparisons
 
+    def heed(self) -> None:
+        """Raises Preempted if the run was asked to stop; all processes call it alike."""
+        self._checks += 1
+        self._cluster.raise_if_preempted(self._checks)
+
     def _tell(self, what: str, count: int) -> Callable[[int], None]:
         def tell(done: int) -> None:
-            self._checks += 1
-            self._cluster.raise_if_preempted(self._checks)
+            self.heed()
             if done:
                 self._console.message(f"{what}: {done} of {count}")
 
@@ -150,7 +162,7 @@ class _OnDevices(Generic[Result]):
         return self._cluster.shared(one).lower(jobs, ()).compile()
 
     def _split(self, jobs: Sequence[Job]) -> Any:
-        rows = [(evaluation, jax.random.key_data(key), np.asarray(samples)) for evaluation, key, samples in jobs]
+        rows = [(_with_rates(e, None), jax.random.key_data(key), np.asarray(samples)) for e, key, samples in jobs]
         return self._cluster.split(jax.tree.map(lambda *leaves: np.stack(leaves), *rows))
 
     def _rows(self, jobs: Any) -> Result:
@@ -168,6 +180,11 @@ class _OnDevices(Generic[Result]):
             results += [row(rows, k) for k in range(len(batch))]
         tell(len(results))
         return results
+
+
+def _with_rates(evaluation: Evaluation, rates: Any) -> Evaluation:
+    where = lambda evaluation: evaluation.funnel.policy.value_rates  # noqa: E731
+    return eqx.tree_at(where, evaluation, rates, is_leaf=lambda leaf: leaf is None)
 
 
 def row(tree: Any, index: int) -> Any:

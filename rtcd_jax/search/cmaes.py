@@ -154,6 +154,11 @@ def stop(strategy: Strategy, state: State) -> Int[Array, ""]:
     return jnp.select(list(holds.values()), [jnp.int32(reason) for reason in holds], jnp.int32(Stop.NONE))
 
 
+def step_size(state: State) -> Float[Array, ""]:
+    """Standard deviation of the population along its widest axis [box widths]."""
+    return state.evolution.std * jnp.sqrt(jnp.linalg.eigvalsh(state.evolution.C)[-1])
+
+
 def restart(strategy: Strategy, state: State, key: Key[Array, ""]) -> State:
     """The same state, or, where `stop` holds, a new search from a mean drawn uniformly from the box.
 

@@ -38,7 +38,7 @@ class Joint:
         return state, reason[None]
 
     def sigma(self, state: cmaes.State) -> Float[Array, ""]:
-        return state.evolution.std
+        return cmaes.step_size(state)
 
 
 @final
@@ -134,7 +134,7 @@ class Nested:
         return after, jnp.concatenate([jnp.where(over, outer_reason, Stop.NONE)[None], inner_reasons])
 
     def sigma(self, state: NestedState) -> Float[Array, ""]:
-        return state.outer.evolution.std
+        return cmaes.step_size(state.outer)
 
     def _with_new_designs(self, state: NestedState, key: Key[Array, ""]) -> NestedState:
         outer, designs = cmaes.ask(self.outer, state.outer, key)

@@ -11,7 +11,7 @@ All randomness of a generation is fold_in(key(seed), index): the same state alwa
 
 import dataclasses
 import functools
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NamedTuple, Protocol, Self, final
 
 import equinox as eqx
@@ -33,6 +33,9 @@ Evaluate = Callable[[Float[Array, "P d"], Key[Array, ""]], Evaluated]
 
 # Generations after which a search without any feasible candidate is given up.
 PATIENCE = 10
+
+GAIN = 1e-3
+"""Share by which the best volume must grow within `search.patience` generations."""
 
 
 class NothingFeasible(UserError):
@@ -91,8 +94,8 @@ class Generation:
 
     `volumes` are [P] each by the objectives' names; `best` (that ranks first) and `median` (over the feasible) are
     those of `objective` in this generation, `best_so_far` that of the archive (all sampled); `feasible` is a share,
-    `counts` and `stops` leave out what did not occur; `sigma` is the (outer) step size [box widths], `evaluations` and
-    `restarts` count from the search's start.
+    `counts` and `stops` leave out what did not occur; `sigma` is the (outer) population's standard deviation along its
+    widest axis [box widths], `evaluations` and `restarts` count from the search's start.
     """
 
     index: int
@@ -144,19 +147,33 @@ def step(plan: Plan, evaluate: Evaluate, state: SearchState) -> tuple[SearchStat
     return after, _record(plan, after, summary, np.asarray(stops))
 
 
-def run(plan: Plan, evaluate: Evaluate, state: SearchState) -> Iterator[tuple[SearchState, Generation]]:
-    """The generations that are left from `state` on, each with the state after it.
+def settled(settings: SearchConfig, best: Sequence[float]) -> bool:
+    """Whether a search is over before its last generation: the `best` volume so far, one number a generation, has not
+    grown by `GAIN` in the latest `patience` ones (of the outer search; 0: never). Under demands it may have to fall.
+    """
+    if settings.at_least:
+        return False
+    patience = settings.patience * (settings.nested.generations if settings.mode == "nested" else 1)
+    return 0 < patience < len(best) and best[-1] <= (1 + GAIN) * best[-1 - patience]
+
+
+def run(
+    plan: Plan, evaluate: Evaluate, state: SearchState, best: Sequence[float] = ()
+) -> Iterator[tuple[SearchState, Generation]]:
+    """The generations that are left from `state` on, each with the state after it; `best` are the volumes of the best
+    candidate so far after each of the generations before.
 
     Raises NothingFeasible once `PATIENCE` generations (or all, if fewer) have passed without any feasible candidate.
     """
-    total = plan.settings.generations
+    total, best = plan.settings.generations, list(best)
     while True:
         done = int(state.generation)
         if done >= min(PATIENCE, total) and not int(state.elites.count):
             raise NothingFeasible({status: int(state.counts[status]) for status in Status}, done)
-        if done >= total:
+        if done >= total or settled(plan.settings, best):
             return
         state, generation = step(plan, evaluate, state)
+        best.append(generation.best_so_far)
         yield state, generation
 
 

@@ -24,7 +24,8 @@ CHUNK = 4
 
 
 def experiment(mode="joint", **search_changes):
-    settings = {"mode": mode, "population": 16, "generations": 24, "nested": {"designs": 4, "generations": 3}}
+    settings = {"mode": mode, "population": 16, "generations": 24, "patience": 0}
+    settings |= {"nested": {"designs": 4, "generations": 3}}
     data = yaml.safe_load(configuration.EXAMPLE)
     data |= {"search": settings | search_changes, "elites": {"count": 3}, "checkpoint": {"seconds": 0.2}}
     return configuration.parse(data)

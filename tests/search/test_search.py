@@ -19,7 +19,8 @@ PEAK = np.array([0.8, 0.6, 0.4])
 
 
 def plan(mode="joint", initial=INITIAL, design=DESIGN, distance=0.02, **changes):
-    settings = {"population": 32, "generations": 12, "nested": NestedConfig(designs=4, generations=3)} | changes
+    settings = {"population": 32, "generations": 12, "nested": NestedConfig(designs=4, generations=3)}
+    settings |= {"patience": 0} | changes
     return Plan(SearchConfig(mode=mode, **settings), ElitesConfig(count=4, distance=distance), initial, design)
 
 
@@ -200,7 +201,46 @@ def test_the_record_agrees_with_the_evaluation():
         assert same(record.statuses, evaluation.status)
         for name, values in evaluation.volumes.named.items():
             np.testing.assert_array_equal(record.volumes[name], np.where(good, values, np.nan))
-        assert record.sigma == state.strategy.evolution.std
+        evolution = state.strategy.evolution
+        widest = np.sqrt(np.linalg.eigvalsh(evolution.std**2 * evolution.C)[-1])
+        assert record.sigma == pytest.approx(widest, rel=1e-12)
+
+
+def test_sigma_is_the_spread_of_the_population_however_the_covariance_is_scaled():
+    """A search that has converged says so: its candidates are that close to one another."""
+    records = [record for _, record in all_of(plan(generations=60, patience=0))]
+    spread = np.linalg.svd(records[-1].genomes - records[-1].genomes.mean(0))[1][0] / np.sqrt(31)
+    assert records[-2].sigma < 0.01 < records[0].sigma
+    assert 0.3 < records[-2].sigma / spread < 3
+
+
+@both_modes
+def test_a_search_that_gains_nothing_ends_after_its_patience(mode):
+    """Nothing is gained from the first generation on; nested, generations of the outer search count."""
+
+    def flat(genomes, key):
+        return population(genomes, jnp.ones(len(genomes)))
+
+    chosen = plan(mode, generations=60, patience=4)
+    patience = 4 * (chosen.settings.nested.generations if mode == "nested" else 1)
+    assert len(all_of(chosen, flat)) == patience + 1
+    assert len(all_of(plan(mode, generations=40, patience=0), flat)) == 40
+
+
+def test_a_search_that_goes_on_ends_where_it_would_have_ended():
+    chosen = plan(generations=60, patience=4)
+    whole = [(state, record.best_so_far) for state, record in all_of(chosen)]
+    assert 8 < len(whole) < 60
+    state, best = whole[7][0], [volume for _, volume in whole[:8]]
+    assert [record.best_so_far for _, record in search.run(chosen, bowl, state, best)] == [v for _, v in whole[8:]]
+    assert search.settled(chosen.settings, [volume for _, volume in whole])
+    assert not search.settled(chosen.settings, [volume for _, volume in whole[:-1]])
+
+
+@pytest.mark.parametrize(("best", "over"), [([np.nan] * 9, False), ([np.nan] * 4 + [1.0], False), ([1.0] * 5, True),
+                                            ([1.0] * 4 + [1.0011], False), ([1.0] * 4, False)])  # fmt: skip
+def test_what_counts_as_no_gain(best, over):
+    assert bool(search.settled(plan(patience=4).settings, best)) == over
 
 
 def test_restarts_are_counted_and_their_reason_is_told():

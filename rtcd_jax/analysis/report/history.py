@@ -35,6 +35,25 @@ def spread(generations: Generations) -> Float[np.ndarray, "2 generations"]:
     return np.array(rows).T
 
 
+def feasible_volumes(generations: Generations) -> dict[str, Float[np.ndarray, " candidates"]]:
+    """All volumes of all candidates with a funnel, of those that every generation has."""
+    names = [name for name in generations[0]["volumes"] if all(name in record["volumes"] for record in generations)]
+    table = {name: [volume for record in generations for volume in record["volumes"][name]] for name in names}
+    volumes = {name: np.array([np.nan if v is None else v for v in values], float) for name, values in table.items()}
+    whole = np.all([np.isfinite(values) for values in volumes.values()], axis=0)
+    return {name: values[whole] for name, values in volumes.items()}
+
+
+def front(
+    objective: Float[np.ndarray, " candidates"], other: Float[np.ndarray, " candidates"]
+) -> Float[np.ndarray, "2 front"]:
+    """Of the candidates' volumes those that no candidate exceeds in both, the largest `objective` first."""
+    order = np.lexsort((-other, -objective))
+    best_before = np.maximum.accumulate(np.append(-np.inf, other[order]))[:-1]
+    chosen = order[other[order] > best_before]
+    return np.stack([objective[chosen], other[chosen]])
+
+
 def failures(generations: Generations) -> dict[str, Float[np.ndarray, " generations"]]:
     """Shares of the candidates of every generation by status, `OK` first."""
     names = dict.fromkeys(name for record in generations for name in record["counts"])

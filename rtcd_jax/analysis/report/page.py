@@ -180,7 +180,8 @@ def _sections(
     )
     yield _section("Initial and optimal", _table(tables.gains(runs)), promise, _note(advice))
     for name, chart in of_search.items():
-        yield _section(chart.title, *_charted(name, chart))
+        table = tables.conflicts(runs[0]) if name == "conflicts" else None
+        yield _section(chart.title, *([_table(table)] if table else []), *_charted(name, chart))
     if alone:
         yield _section("Elites", _table(tables.elites(alone)), _note("Click a heading to sort."))
     yield _section("Certificates", *_certified(runs))

@@ -6,7 +6,7 @@ import numpy as np
 
 from rtcd_jax.analysis.report.canvas import BLACK, GRAY
 from rtcd_jax.analysis.report.charts import Band, Chart, Curve, Panel, Shares, Style, more_than_a_decade
-from rtcd_jax.analysis.report.history import QUANTILES, column, courses, failures, spread
+from rtcd_jax.analysis.report.history import QUANTILES, column, courses, failures, feasible_volumes, front, spread
 from rtcd_jax.analysis.report.reading import BLUE, VERMILION, Run
 from rtcd_jax.analysis.report.words import volume_unit, words
 
@@ -27,7 +27,11 @@ def charts(runs: Sequence[Run]) -> dict[str, Chart]:
     """The charts of one run's search, or of several compared ones, by name; none where nothing was searched."""
     if len(runs) > 1:
         return {"convergence": compared_convergence(runs)}
-    return {"convergence": convergence(runs[0]), "courses": variables(runs[0])} if runs[0].generations else {}
+    if not runs[0].generations:
+        return {}
+    found = {"convergence": convergence(runs[0]), "courses": variables(runs[0])}
+    conflicting = conflicts(runs[0])
+    return found | ({"conflicts": conflicting} if conflicting.panels else {})
 
 
 def convergence(run: Run) -> Chart:
@@ -76,6 +80,22 @@ def variables(run: Run) -> Chart:
         panels.append(Panel("", marks, course.title, course.logarithmic, course.window))
     rows = -(-len(panels) // 2)
     return Chart("Design and weights", "generation", panels, 1.9 * rows + 0.4, columns=2)
+
+
+def conflicts(run: Run) -> Chart:
+    """Pareto fronts of all candidates: the searched volume and each of the others that gains where it is given away."""
+    objective = run.config.search.objective
+    volumes, panels = feasible_volumes(run.generations), []
+    for name, values in volumes.items():
+        if name == objective or not values.size:
+            continue
+        x, y = front(volumes[objective], values)
+        if x.size > 1:
+            label = f"{words(name)}\n[{volume_unit(run.config, name)}]"
+            panels.append(Panel(label, [Curve(x, y, "front", VERMILION, style="marked")]))
+    label = f"{words(objective)} [{volume_unit(run.config, objective)}]"
+    note = "sampled, as the search saw it: no candidate is larger in both volumes than one of a front"
+    return Chart("What conflicts", label, panels, 1.5 * len(panels) + 0.5, note)
 
 
 def compared_convergence(runs: Sequence[Run]) -> Chart:

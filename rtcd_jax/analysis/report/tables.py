@@ -5,7 +5,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, cast, final
 
-from rtcd_jax.analysis.report.history import OPTIONS
+from rtcd_jax.analysis.report.history import OPTIONS, feasible_volumes
 from rtcd_jax.analysis.report.reading import Experiment, Run, Tolerance
 from rtcd_jax.analysis.report.words import duration, listed, ratio, volume_unit, words
 from rtcd_jax.volume import VOLUMES
@@ -76,6 +76,26 @@ def elites(run: Run) -> Table:
             *([(record.get("mjx") or {}).get("difference")] if compared else []),
         )  # fmt: skip
         rows.append((*row, *shown.get(name, (None, None))) if shown else row)
+    return Table(heads, tuple(rows))
+
+
+GIVEN_AWAY = (0.0, 0.01, 0.02, 0.05, 0.1)
+"""Shares of the searched volume."""
+
+
+def conflicts(run: Run) -> Table | None:
+    """What every other volume could be for a share of the searched one; None where nothing was searched."""
+    objective = run.config.search.objective
+    volumes = feasible_volumes(run.generations) if run.generations else {}
+    others = [name for name in volumes if name != objective]
+    if not others or not volumes[objective].size:
+        return None
+    columns = (f"largest {words(name)} [{volume_unit(run.config, name)}]" for name in others)
+    heads = (f"of {words(objective)} given away [%]", *columns)
+    rows = []
+    for share in GIVEN_AWAY:
+        allowed = volumes[objective] >= (1 - share) * volumes[objective].max()
+        rows.append((100 * share, *(float(volumes[name][allowed].max()) for name in others)))
     return Table(heads, tuple(rows))
 
 

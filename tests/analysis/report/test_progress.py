@@ -5,6 +5,7 @@ import pytest
 from matplotlib.collections import LineCollection
 from matplotlib.text import Text
 
+from rtcd_jax.analysis.report import tables
 from rtcd_jax.analysis.report.canvas import print_chart
 from rtcd_jax.analysis.report.history import courses, failures, physical, spread
 from rtcd_jax.analysis.report.history import searched as searched_variables
@@ -42,6 +43,41 @@ def test_convergence_draws_the_stored_numbers_with_gaps_where_there_were_none(tm
     assert {text.get_text() for text in share.get_legend().get_texts()} == {"has a funnel", "funnel empty"}
     assert volumes.get_ylabel() == "volume (sum) [rad²/s]"
     assert volumes.get_legend().get_title().get_text().startswith("sampled")
+
+
+def conflicting(count=40):
+    """Candidates whose volumes trade a sum for an inlet, some of them worse in both, one without a funnel."""
+    share = np.linspace(0, 1, count)
+    sums, inlets = 100 * (1 - share**2), 2 + 3 * share
+    sums[3::7], inlets[3::7] = 0.5 * sums[3::7], 0.5 * inlets[3::7]
+    volumes = {"sum": [*sums[:-1].tolist(), None], "inlet": [*inlets[:-1].tolist(), None]}
+    return [generation(0, volumes=volumes)], sums[:-1], inlets[:-1]
+
+
+def test_a_front_has_all_candidates_that_no_other_exceeds_in_both(tmp_path, figures):
+    records, sums, inlets = conflicting()
+    draw("conflicts", searched(tmp_path, records))
+    drawn = figures[0].axes[0].lines[0].get_xydata()
+    larger = lambda a, b: (sums >= a) & (inlets >= b) & (sums + inlets > a + b)  # noqa: E731
+    by_hand = [pair for pair in zip(sums, inlets, strict=True) if not np.any(larger(*pair))]
+    assert len(by_hand) == len(sums) - len(sums[3::7])
+    np.testing.assert_allclose(sorted(map(tuple, drawn)), sorted(by_hand))
+
+
+def test_the_table_says_what_a_share_of_the_searched_volume_buys(tmp_path):
+    records, sums, inlets = conflicting()
+    table = tables.conflicts(searched(tmp_path, records))
+    assert table.heads == ("of sum given away [%]", "largest initial ellipsoid [rad²/s]")
+    for percent, inlet in table.rows:
+        assert inlet == max(inlets[sums >= (1 - percent / 100) * sums.max()])
+    assert table.rows[0][1] == 2
+    assert table.rows[1][1] == pytest.approx(2 + 3 * 2 / 39)
+
+
+def test_nothing_conflicts_where_one_volume_was_stored(tmp_path):
+    run = searched(tmp_path, [generation(0), generation(1)])
+    assert "conflicts" not in charts([run])
+    assert tables.conflicts(run) is None
 
 
 def test_restarts_are_marked_at_their_generations_alone(tmp_path, figures):
