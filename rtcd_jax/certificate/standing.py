@@ -21,7 +21,7 @@ import numpy as np
 
 from rtcd_jax.certificate import check
 from rtcd_jax.certificate.check import Damaged, Node, Refused, Report, Undecided
-from rtcd_jax.certificate.prove.closed_loop import claim_of
+from rtcd_jax.certificate.prove.closed_loop import claim_of, claim_of_version_1
 from rtcd_jax.elite.elite import Elite
 from rtcd_jax.system.errors import UserError
 from rtcd_jax.system.files import replace_json
@@ -89,7 +89,7 @@ def standing_of(
     except (Refused, KeyError, TypeError, RecursionError) as error:
         return Standing("damaged", f"{path} is no certificate: {error}")
     try:
-        other = difference(content["claim"], claim_of(elite))
+        other = difference(content["claim"], elite)
     except UserError as error:
         other = str(error)
     if other:
@@ -98,14 +98,42 @@ def standing_of(
     return _remembered(digest) or _checked(content, digest, progress)
 
 
-def difference(claimed: Mapping[str, Any], stored: Mapping[str, Any]) -> str:
-    """The first number of a certificate's claim that is not the stored elite's, with both; empty if there is none."""
+def difference(claimed: Mapping[str, Any], elite: Elite) -> str:
+    """The first number of a certificate's claim that is not the stored elite's, with both; empty if there is none.
+
+    Of a number that is uncertain in the claim, the elite's own must lie between its bounds.
+    """
+    if "plant" in claimed:
+        stored = claim_of_version_1(elite)
+    else:
+        stored = claim_of(elite)
+        if claimed["robot"] != stored["robot"]:
+            return "robot is another there"
+        for key in ("parameters", "limit"):
+            if text := _outside(key, claimed[key], stored[key]):
+                return text
+        stored = {key: stored[key] for key in _OF_THE_LOOP}
     largest = np.max(np.abs([float.fromhex(rate) for rate in np.ravel(stored["rates"])]))
     for key in sorted(stored, key="rates".__eq__):  # the rates last: they follow from the others
         text = _difference(key, claimed[key], stored[key], RATE_ROUNDING * largest if key == "rates" else 0.0)
         if text:
             return text
     return ""
+
+
+_OF_THE_LOOP = ("state_limits", "dt", "x", "u", "K", "x_goal", "K_goal", "rates")
+
+
+def _outside(place: str, claimed: Any, stored: Any) -> str:
+    """Ranges beside exact numbers, or objects of them."""
+    if isinstance(stored, dict):
+        pairs = ((f"{place}.{name}", claimed[name], value) for name, value in stored.items())
+        return next(filter(None, (_outside(*pair) for pair in pairs)), "")
+    (low, high), value = map(float.fromhex, claimed), float.fromhex(stored[0])
+    if low <= value <= high:
+        return ""
+    theirs = f"= {low!r}" if low == high else f"in [{low!r}, {high!r}]"
+    return f"{place} {theirs} there, {value!r} in the elite"
 
 
 def _difference(place: str, claimed: Any, stored: Any, tolerance: float) -> str:

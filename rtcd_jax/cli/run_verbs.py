@@ -297,16 +297,17 @@ class CertifyOptions(Options):
         default="proved", description="to be shown"
     )
     optimize_value: bool = Field(default=False, description="choose the ellipsoids' shapes too")
+    uncertainty: Annotated[Path | None, shown("FILE", "what the run bears")] = Field(
+        default=None, description="a YAML of what the proof bears, as `uncertainty` of a configuration; none: one model"
+    )
     workers: int = Field(default=0, description="processes, one elite each; 0 for one a core [-]", ge=0)
 
 
 def certify(options: CertifyOptions, console: Console) -> Exit:
     from rtcd_jax.certificate.prove.run import certify_run
 
-    workers = options.workers or cores()
-    return _verdict(
-        certify_run(options.run, options.elites, options.guarantee, workers, console, options.optimize_value)
-    )
+    workers, more = options.workers or cores(), (options.optimize_value, options.uncertainty)
+    return _verdict(certify_run(options.run, options.elites, options.guarantee, workers, console, *more))
 
 
 def _certificate(path: Path) -> Path:
@@ -327,16 +328,19 @@ class FalsifyOptions(Options):
         description="a certificate, or a run folder (its 000)"
     )
     rollouts: int = Field(default=1_000_000, description="motions to simulate [-]", ge=1)
-    seed: int = Field(default=0, description="of their starts [-]", ge=0)
+    seed: int = Field(default=0, description="of their starts, robots and disturbances [-]", ge=0)
     workers: int = Field(default=0, description="processes, 0 for one a core [-]", ge=0)
+    beyond: float = Field(
+        default=1.0, description="factor of all that the certificate leaves uncertain [-]", ge=0, le=100
+    )
 
 
 def falsify(options: FalsifyOptions, console: Console) -> Exit:
     from rtcd_jax.certificate.falsify.falsify import falsify_file
 
-    return _verdict(
-        falsify_file(options.certificate, options.rollouts, options.seed, options.workers or cores(), console)
-    )
+    workers = options.workers or cores()
+    held = falsify_file(options.certificate, options.rollouts, options.seed, workers, console, options.beyond)
+    return _verdict(held)
 
 
 def _assignment(text: str) -> str:

@@ -271,6 +271,22 @@ def with_mjcf(data: Any, path: Path) -> Any:
         raise ConfigError([Problem(("plant", "mjcf"), str(error), plant["mjcf"])], str(path)) from None
 
 
+def parse_uncertainty(data: Any, source: str) -> UncertaintyConfig:
+    """What is uncertain, of a mapping with the section's keys; `ConfigError` names everything that is wrong with it."""
+    try:
+        return UncertaintyConfig.model_validate(data)
+    except ValidationError as error:
+        raise ConfigError(problems_of(error), source) from None
+
+
+def load_uncertainty(path: Path) -> UncertaintyConfig:
+    """The `uncertainty` section of a YAML file, or a file of its keys alone; `ConfigError` as `load`."""
+    data = read_yaml(path)
+    if isinstance(data, Mapping) and "uncertainty" in data:
+        data = data["uncertainty"]
+    return parse_uncertainty({} if data is None else data, str(path))
+
+
 def read_yaml(path: Path) -> Any:
     """What a YAML file holds, as it stands there; `ConfigError` if there is no such file, or no YAML in it."""
     if not path.is_file():

@@ -7,8 +7,7 @@ from typing import Any, final
 import numpy as np
 from jaxtyping import Float
 
-from rtcd_jax.certificate.check import Node, parse, read_claim, read_interval
-from rtcd_jax.certificate.check.file import read_goal
+from rtcd_jax.certificate.check import Node, parse, read_claim, read_goal, read_interval
 
 
 @final
@@ -35,7 +34,7 @@ class ProvedFunnel:
             begins.append(float(interval.knot + interval.start))
             first, last, (bend_0, bend_1) = map(_floats, (interval.first, interval.last, interval.bend))
             axes.append([(first + last) / 2 + bend_0, (last - first) / 2 + bend_1, -bend_0, -bend_1])
-        goal = _floats(read_goal(Node("goal", content["goal"]), claim)[0])
+        goal = _floats(read_goal(Node("goal", content["goal"]), claim).axes)
         begins.append(float(len(claim.u)))
         axes.append([goal, 0 * goal, 0 * goal, 0 * goal])
         return cls(np.array(begins), np.array(axes), _floats(claim.rates))

@@ -1,4 +1,7 @@
-"""A certificate's closed loop and funnel in floats, written apart from the package: to falsify what is proved."""
+"""A certificate's closed loop and funnel in floats, written apart from the package: to falsify what is proved.
+
+One robot and no disturbance: that of a claim without uncertainty.
+"""
 
 import numpy as np
 
@@ -12,12 +15,12 @@ def floats(values):
 class Simulated:
     """Motions that start on and in the ellipsoid of one interval, followed to t_N and beyond."""
 
-    def __init__(self, content, steps=20, rate=rate, limit="torque_limit"):
+    def __init__(self, content, steps=20, rate=rate):
         claim = content["claim"]
-        self.parameters = {key: float.fromhex(v) for key, v in claim["parameters"].items()}
+        self.parameters = {key: float.fromhex(low) for key, (low, _) in claim["parameters"].items()}
         self.x, self.rates, self.u, self.K = (floats(claim[key]) for key in ("x", "rates", "u", "K"))
         self.goal, self.goal_gain, self.dt = (floats(claim[key]) for key in ("x_goal", "K_goal", "dt"))
-        self.limit, self.steps, self.rate = self.parameters[limit], steps, rate
+        self.limit, self.steps, self.rate = floats(claim["limit"])[0], steps, rate
         self.funnel, self.goal_axes = content["funnel"], floats(content["goal"]["axes"])
 
     def nominal(self, k, t):

@@ -165,7 +165,7 @@ def test_positive_definite_matrices():
 
 def test_positive_polynomials():
     def shown(*coefficients):
-        return check.is_positive(SPACE.compose(coefficients, SPACE.s), Q(-1), Q(1))
+        return check.is_positive(SPACE.compose(coefficients, SPACE.s), {0: (Q(-1), Q(1))})
 
     assert shown(Q(1), Q(0), Q(-99, 100))
     assert not shown(Q(1), Q(0), Q(-1))
@@ -191,12 +191,13 @@ def test_models_are_the_plants(name):
     plant = packaged(name)
     design = plant.Design(*(jnp.asarray(v) for v in random.uniform(0.2, 0.7, 2)))
     parameters, model = plant.parameters(design), check.PLANTS[name]
-    assert (model.states, model.units, (model.input_unit,)) == (plant.state_names, plant.state_units, plant.input_units)
+    robot = model.robot
+    assert (robot.states, robot.units, (robot.input_unit,)) == (plant.state_names, plant.state_units, plant.input_units)
     assert set(model.parameters) == parameters.keys()
     assert (parameters[model.limit],) == plant.input_limit
     x, u = random.normal(size=(plant.n, 100)) * 3, random.normal(size=(1, 100))
     expected = plant.dynamics(design, jnp.asarray(x), jnp.asarray(u))
-    np.testing.assert_allclose(rate(model, parameters, x, u[0]), expected, rtol=1e-11, atol=1e-11)
+    np.testing.assert_allclose(rate(robot, parameters, x, u[0]), expected, rtol=1e-11, atol=1e-11)
 
 
 def test_the_checker_runs_on_the_standard_library_alone():

@@ -24,7 +24,7 @@ def folder_of(path, **changed):
 
 
 def claimed(elite):
-    told = {**claim_of(elite), "start": [0, double(0.0)]}
+    told = {**claim_of(elite), "start": [0, double(0.0)], "push": double(0.0)}
     return check.read_claim(check.Node("claim", with_digests(told)))
 
 
@@ -35,7 +35,10 @@ def test_the_claim_is_the_elite_bit_by_bit(content):
         stored = arrays[name].reshape(np.shape(value))
         assert [float(c) for c in np.ravel(value)] == stored.ravel().tolist()
     assert float(claim.dt) == swing.DT
-    assert {key: float(v) for key, v in claim.parameters.items()} == swing.PARAMETERS
+    limit = {"torque_limit": float(claim.limits[0])}
+    assert {key: float(low) for key, (low, _) in claim.parameters.items()} | limit == swing.PARAMETERS
+    assert all(low == high for low, high in (*claim.parameters.values(), claim.limits))
+    assert (claim.disturbance, claim.age, *claim.noise) == (0, 0, 0, 0)
     assert [float(b) for b in claim.bounds] == record["state_limits"]
     rates = np.array([[[float(c) for c in end] for end in pair] for pair in claim.rates])
     for k, u in enumerate(arrays["u"][:, 0]):

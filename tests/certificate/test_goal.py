@@ -34,7 +34,9 @@ class Upright:
         }  # fmt: skip
         record = {"plant": "pendulum", "parameters": parameters, "state_limits": [None, None], **swing.PROMISE}
         elite = Elite.of(arrays, record)
-        claim = check.read_claim(check.Node("claim", with_digests({**claim_of(elite), "start": [0, double(0.0)]})))
+        claim = check.read_claim(
+            check.Node("claim", with_digests({**claim_of(elite), "start": [0, double(0.0)], "push": double(0.0)}))
+        )
         self.claim, self.loop = claim, Loop(claim, elite)
         region = goal_region(claim, self.loop, exact=True)
         assert region is not None

@@ -36,7 +36,7 @@ def test_a_proved_elite(run, content):
     assert found.proved
     assert found.reason == ""
     assert found.claim == check.digest(content["claim"]) == content["sha256"]["claim"]
-    assert f"Claim: sha256 {found.claim}." in check.sentence("pendulum", check.check(content))
+    assert f"Claim: sha256 {found.claim}." in check.sentence(check.check(content))
     assert (found.start, found.intervals) == (0.0, len(content["funnel"]))
     assert found.volumes == check.check(content).volumes
 

@@ -74,8 +74,8 @@ def read_external(path: Path, name: str, parameters: Mapping[str, float], funnel
         raise UserError(f"--plant = {name!r}: unknown plant; {closest(name, tuple(PLANTS))}")
     plant = PLANTS[name]
     _require_parameters(plant, name, parameters)
-    n = len(plant.states)
-    columns = f"time, {', '.join(plant.states)}, input"
+    n = len(plant.robot.states)
+    columns = f"time, {', '.join(plant.robot.states)}, input"
     if funnel is None:
         entries = n * (n + 1) // 2
         table = _numbers(path, n + 3 + entries, f"{columns}, rho, upper triangle of S", last=n + 1)
@@ -168,7 +168,8 @@ def _levels_and_values(path: Path, knots: int, n: int) -> tuple[np.ndarray, np.n
 def _goal(path: Path, plant: Plant, last: np.ndarray) -> np.ndarray:
     """The equilibrium at the last state: at rest, the angle a multiple of pi."""
     goal = last.copy()
-    goal[plant.angle] = round(last[plant.angle] / math.pi) * math.pi
+    for i in plant.robot.hinges:
+        goal[i] = round(last[i] / math.pi) * math.pi
     goal[len(goal) // 2 :] = 0
     if np.max(np.abs(goal - last)) > AT_GOAL:
         raise UserError(f"{path}: the last state {last.tolist()} must be at rest, its angle a multiple of pi")
@@ -195,7 +196,7 @@ class Cost(NamedTuple):
             if len(values) != n or not all(
                 SMALLEST <= value <= (LARGEST if name == "q" else math.inf) for value in values
             ):
-                states = ", ".join(external.plant.states)
+                states = ", ".join(external.plant.robot.states)
                 raise UserError(f"--{name} = {' '.join(map(str, values))}: must be {n} numbers > 0 ({states})")
         if not SMALLEST <= r <= LARGEST:
             raise UserError(f"--r = {r}: must be > 0 and at most {LARGEST:g}")
@@ -206,7 +207,7 @@ def elite_of(external: ExternalFunnel, cost: Cost) -> tuple[dict[str, np.ndarray
     """Arrays and record as `elites/NNN` has them; the gains are R^-1 B'S, and the goal's those of the last knot."""
     inputs = np.append(external.u, 0.0)
     jumps = np.array(
-        [linear(external.plant, external.parameters, x, u)[1] for x, u in zip(external.x, inputs, strict=True)]
+        [linear(external.plant.robot, external.parameters, x, u)[1] for x, u in zip(external.x, inputs, strict=True)]
     )
     gains = [b @ s / cost.r for b, s in zip(jumps, external.S, strict=True)]
     volumes, pushes = external.volumes, largest_pushes(external.S, external.rho, jumps[:, :, None])

@@ -4,47 +4,59 @@
 package: the standard library is enough, and python-flint makes it faster. To trust a certificate is to trust this
 folder and nothing else. Read it in this order:
 
-    exact     rational numbers and their rounding
-    taylor    Taylor models: polynomials in time and space with bounds of their remainders; sine and cosine
-    matrix    products and determinants
-    claim     the robots' equations, and the closed loop that a certificate is about
-    squares   positive on the sphere: sums of squares, by Bernstein polynomials in the time
-    funnel    the obligations of one interval of the funnel
-    goal      the obligations of the goal region
-    file      the file's text into exact numbers
-    verdict   every obligation of a certificate, and what follows
-    command   `rtcd check`
+    exact       rational numbers and their rounding
+    taylor      Taylor models: polynomials in time, space and robots with bounds of their remainders; sine and cosine
+    matrix      products and determinants
+    squares     positive on the sphere: sums of squares, by Bernstein polynomials in the time and in the robot's numbers
+    robot       a robot's equations from its mass matrix and potential; det M > 0 for all angles
+    claim       the robots and closed loops that a certificate is about
+    saturation  what the motor gives, between two saturated laws
+    funnel      the obligations of one interval of the funnel
+    push        the largest impulse
+    goal        the obligations of the goal region
+    version1    the two robots that files of version 1 name
+    file        the file's text into exact numbers
+    verdict     every obligation of a certificate, and what follows
+    command     `rtcd check`
 
-THEOREM. Let the claim hold a robot x' = f(x, u) with D(x) f(x, u) = a(x) + b(x) u, where a, b, D are polynomials in x
-and in the sine and cosine of one angle (claim.py), and its controller
+THEOREM. The claim holds a robot: its mass matrix M, potential, dampers and one motor, whose numbers p lie in a box (at
+every instant; they may vary in time). With D = det M, D x' = a + b (u + w). Its controller is
 
-    u = clip(u_k - K(t) (x - x*(t)), -F, F)  on [t_k, t_{k+1}],      u = clip(-K_g (x - x_g), -F, F)  after t_N,
+    u = clip(u_k - phi, -F, F)  on [t_k, t_{k+1}],      u = clip(-phi, -F, F)  after t_N,
 
-with x* the cubic Hermite interpolant of the claimed states and rates, K linear between K_k and K_{k+1}. If `check`
-accepts, then with E(t) = {x*(t) + L(t) y : |y| <= 1} and G = {x_g + L_g y : |y| <= 1} of the certificate, every motion
-that is in E(t) at some t of [start, t_N] stays in E until t_N, is then in G, never leaves G, and comes and stays as
-close to x_g as reported; and in E and G no state exceeds its limit.
+with any F between its bounds, any measurable |w(t)| <= w_max, and the feedback phi = K(r) (x(r) + e - x*(r)), after t_N
+K_g (x(r) + e - x_g), of a measurement at some time r: not more than `age` before, not before the motion began, not by
+the controller of another phase; with any error |e_i| <= `noise`_i. x* is the cubic Hermite interpolant of the claimed
+states and rates, K linear between K_k and K_{k+1}. If `check` accepts, then with E(t) = {x*(t) + L(t) y : |y| <= 1} and
+G = {x_g + L_g y : |y| <= 1} of the certificate, every motion that is in E(t) at some t of [start, t_N] stays in E until
+t_N, is then in G, never leaves G, and comes and stays as close to x_g as reported; in E and G no state exceeds its
+limit; and x*(t) + M^-1 (motor) J is in E(t) for all t of [start, t_N] and |J| <= `push`.
 
 PROOF. *Funnel.* In y, d/dt |y|^2 = 2 y'L^-1 (f - x*' - L'y). Let L = L(s), s in [-1, 1] the time of one interval,
-det L > 0 and D > 0. Then q = -2 c y' adj(L) (a + b u - D (x*' + L'y)), with a constant c > 0, is -d/dt |y|^2 times a
-positive function. On the sphere |y| = 1 one of three cases holds: |u_lin| <= F and u = u_lin, or u_lin >= F and u = F,
-or u_lin <= -F and u = -F. For each, q is a polynomial p(s, y) up to a remainder r (sine, cosine and every rounding
-enclosed), and the certificate gives p = sum_j B_j(s) p_j(y) in Bernstein polynomials with, modulo |y|^2 = 1,
+det L > 0; det M > 0 is shown for all angles and robots (robot.py). Then q = -2 c y' adj(L) (a + b (u + w) -
+D (x*' + L'y)), with a constant c > 0, is -d/dt |y|^2 times a positive function. The feedback differs from K (x - x*) by
+at most `error` = sum_i |K_i| noise_i + age speed, where |d/dt K (x - x*)| <= speed is shown in E. So u + w lies between
+two saturated laws (saturation.py), and since q is affine in it, it is enough that q > 0 for both. On the sphere |y| = 1
+one of three cases holds for each law: it is free, or at the upper, or at the lower limit. For each, q is a polynomial
+p(s, y, robot) up to a remainder r (sine, cosine and every rounding enclosed). In Bernstein polynomials of the robot's
+numbers it is a mean of its control points, each a polynomial p(s, y), so that it is enough that these are > r; and the
+certificate gives p = sum_j B_j(s) p_j(y) in Bernstein polynomials with, modulo |y|^2 = 1,
 
     p_j = z'G_j z + sum_i (sigma_i g_i)_j + rest_j,    G_j > 0,    sigma_i = sum_a B_a(s) z'S_ia z,    S_ia > 0,
 
 g_i >= 0 the inequalities of the case. B_j >= 0 and sum_j B_j = 1, so that q >= min_j inf rest_j - r = margin > 0 on the
-case. So |y| decreases wherever |y| = 1: no motion leaves E (its right side is Lipschitz in x, its intervals join
-without a gap).
-*Goal.* The same with y = l z, |z| = 1, l in [0, 1] in the place of s, and q divided by l^2: the remainder of q is
-r l^2 + d l, where d bounds what does not vanish with l (x_g is a rounded multiple of pi). |y| decreases wherever
-l > d / margin. QED
+case. So |y| decreases wherever |y| = 1: no motion leaves E (x' is bounded, and the intervals join without a gap).
+*Goal.* The same with y = l z, |z| = 1, l in [rest, 1] in the place of s, and q divided by l. So |y| decreases wherever
+l >= rest. Where no w, noise or age acts, rest = 0, and q is divided by l^2 where u is free: the remainder of q is
+r l^2 + d l, where d bounds what does not vanish with l (x_g is a rounded multiple of pi), and |y| decreases wherever
+l > d / margin.
+*Push.* |L^-1 (b / D) J| < 1 is (D det L)^2 > |adj(L) b J|^2, one inequality in s and the robot's numbers. QED
 
 Every number of a file is an exact double in hexadecimal notation. Digests show where a file was changed; the theorem
 does not rest on them.
 """
 
-from rtcd_jax.certificate.check.claim import PLANTS, Claim, Plant
+from rtcd_jax.certificate.check.claim import Claim
 from rtcd_jax.certificate.check.command import SECONDS, main, within
 from rtcd_jax.certificate.check.exact import (
     PI,
@@ -60,14 +72,18 @@ from rtcd_jax.certificate.check.exact import (
     root_up,
     up,
 )
-from rtcd_jax.certificate.check.file import Node, digest, parse, read_bytes, read_claim, read_interval
-from rtcd_jax.certificate.check.funnel import Interval, Motion, funnel_obligations, motion, require_bounds
-from rtcd_jax.certificate.check.goal import Shell, goal_field, goal_obligations
+from rtcd_jax.certificate.check.file import Node, digest, parse, read_bytes, read_claim, read_goal, read_interval
+from rtcd_jax.certificate.check.funnel import Interval, Motion, funnel_obligations, funnel_speed, motion, require_bounds
+from rtcd_jax.certificate.check.goal import GoalField, Shell, goal_field, goal_obligations, goal_speed
 from rtcd_jax.certificate.check.matrix import cofactors
+from rtcd_jax.certificate.check.push import cube, push_clearance, require_push
+from rtcd_jax.certificate.check.robot import HINGE, SLIDE, Equations, Robot, Term, derive, mass_is_definite
+from rtcd_jax.certificate.check.saturation import cases_of, error_under, input_error
 from rtcd_jax.certificate.check.squares import (
     GramCertificate,
     Obligation,
     bernstein,
+    control_points,
     is_positive,
     is_positive_definite,
     margin,
@@ -76,3 +92,4 @@ from rtcd_jax.certificate.check.squares import (
 )
 from rtcd_jax.certificate.check.taylor import Space, Taylor, economize, peak, polynomial, sine_and_cosine, terms_of
 from rtcd_jax.certificate.check.verdict import FORMAT, VERSION, Report, check, check_file, sentence, volumes_of
+from rtcd_jax.certificate.check.version1 import PLANTS, Plant

@@ -1,67 +1,27 @@
-"""What a certificate is about: a robot's equations and its closed loop, in exact numbers."""
+"""What a certificate is about: robots of a box, their closed loop, and all that acts on it, in exact numbers."""
 
-from collections.abc import Callable
 from typing import Any, NamedTuple
 
-
-class Plant(NamedTuple):
-    """D f = a + b u. `field(parameters, x, sine, cosine)` gives D, a [n] and b [n], for any kind of number."""
-
-    states: tuple[str, ...]
-    units: tuple[str, ...]
-    input_unit: str
-    angle: int
-    limit: str
-    parameters: tuple[str, ...]
-    field: Callable
-
-
-def _pendulum(p, x, sine, cosine):
-    inertia = p["m"] * p["l"] * p["l"]
-    drift = x[1] * (-p["b"] / inertia) + sine * (-p["g"] / p["l"])
-    return x[0] * 0 + 1, [x[1], drift], [x[0] * 0, x[0] * 0 + 1 / inertia]
-
-
-def _cartpole(p, x, sine, cosine):
-    """M (cart'', theta'') = (tau_1, tau_2) by Cramer's rule, D = det M; M_12 = -Mp lp cos(theta)."""
-    moment = p["Mp"] * p["lp"]
-    pivot, total = p["inertia_about_com"] + moment * p["lp"], p["Mc"] + p["Mp"]
-    tau_1 = x[2] * -p["Beq"] + sine * x[3] * x[3] * -moment
-    tau_2 = sine * (moment * p["g"]) + x[3] * -p["Bp"]
-    coupling = cosine * moment
-    determinant = coupling * coupling * -1 + pivot * total
-    drift = [determinant * x[2], determinant * x[3], tau_1 * pivot + coupling * tau_2, coupling * tau_1 + tau_2 * total]
-    return determinant, drift, [x[0] * 0, x[0] * 0, x[0] * 0 + pivot, coupling]
-
-
-PLANTS = {
-    "pendulum": Plant(
-        ("theta", "theta_dot"),
-        ("rad", "rad/s"),
-        "N m",
-        0,
-        "torque_limit",
-        ("m", "l", "b", "g", "torque_limit"),
-        _pendulum,
-    ),
-    "cartpole": Plant(
-        ("cart", "theta", "cart_dot", "theta_dot"),
-        ("m", "rad", "m/s", "rad/s"),
-        "N",
-        1,
-        "force_limit",
-        ("Mc", "Mp", "lp", "inertia_about_com", "Beq", "Bp", "g", "force_limit"),
-        _cartpole,
-    ),
-}
+from rtcd_jax.certificate.check.robot import Equations, Robot
+from rtcd_jax.certificate.check.taylor import Space
 
 
 class Claim(NamedTuple):
-    """The closed loop that the proof is about, in exact numbers."""
+    """The closed loops that the proof is about.
 
-    plant: Plant
-    parameters: dict[str, Any]
-    limit: Any
+    `parameters` has the least and the largest value of each of the robot's numbers, `limits` of the motor's.
+    `disturbance` bounds |w(t)|, `noise` [n] the errors of the measured state, `age` [s] how old a measurement that acts
+    is, `speed` [input/s] how fast the feedback changes. A motion on x* survives an impulse of |J| <= `push` [input s]
+    on the motor.
+    """
+
+    equations: Equations
+    parameters: dict[str, tuple[Any, Any]]
+    limits: tuple[Any, Any]
+    disturbance: Any
+    noise: list
+    age: Any
+    speed: Any
     bounds: list
     dt: Any
     x: list
@@ -71,7 +31,33 @@ class Claim(NamedTuple):
     x_goal: list
     K_goal: list
     start: tuple[int, Any]
+    push: Any
+
+    @property
+    def robot(self) -> Robot:
+        return self.equations.robot
 
     @property
     def n(self) -> int:
         return len(self.x_goal)
+
+    @property
+    def uncertain(self) -> list[str]:
+        """The names of the robot's uncertain numbers."""
+        return sorted(name for name, (low, high) in self.parameters.items() if low < high)
+
+    @property
+    def moves_the_goal(self) -> bool:
+        """Whether something acts at the goal that keeps motions from coming to rest there."""
+        return self.disturbance != 0 or self.age != 0 or any(noise != 0 for noise in self.noise)
+
+    def space(self, s_order: int, y_order: int) -> Space:
+        return Space(self.n, s_order, y_order, len(self.uncertain))
+
+    def numbers(self, space: Space) -> dict[str, Any]:
+        """The robot's numbers by name: an exact one, or all between its bounds."""
+        among = {name: i for i, name in enumerate(self.uncertain)}
+        return {
+            name: space.between(low, high, among[name]) if name in among else low
+            for name, (low, high) in self.parameters.items()
+        }

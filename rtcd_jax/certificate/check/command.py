@@ -8,7 +8,6 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
-from rtcd_jax.certificate.check.claim import PLANTS
 from rtcd_jax.certificate.check.exact import Refused, Undecided, printable
 from rtcd_jax.certificate.check.file import parse, read_bytes
 from rtcd_jax.certificate.check.verdict import check_file, sentence
@@ -53,8 +52,7 @@ def main(arguments: Sequence[str]) -> int:
     except Refused as refused:
         print(f"REFUSED {printable(file)}\n{refused}", file=sys.stderr)
         return 1
-    name = next(key for key, plant in PLANTS.items() if plant is report.claim.plant)
-    print(sentence(name, report))
+    print(sentence(report))
     for key, value in report.notes.items():
         print(printable(f"note of the file's author, not proved: {key}: {value}", LONGEST_NOTE))
     if compared:

@@ -4,10 +4,11 @@ import hashlib
 import json
 import math
 import re
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from rtcd_jax.certificate.check.claim import PLANTS, Claim
+from rtcd_jax.certificate.check.claim import Claim
 from rtcd_jax.certificate.check.exact import (
     MAX_BYTES,
     MAX_ORDER,
@@ -21,9 +22,17 @@ from rtcd_jax.certificate.check.exact import (
 )
 from rtcd_jax.certificate.check.funnel import Interval
 from rtcd_jax.certificate.check.goal import Shell
+from rtcd_jax.certificate.check.robot import HINGE, SLIDE, Equations, Function, Robot, Term, derive, mass_is_definite
 from rtcd_jax.certificate.check.squares import GramCertificate, monomials
+from rtcd_jax.certificate.check.version1 import PLANTS
 
 MAX_NOTES = 20
+LONGEST_NAME = 40
+MOST_JOINTS, MOST_TERMS_OF_ROBOT, HIGHEST = 4, 200, 8
+"""Of a robot; wave numbers and powers are at most `HIGHEST`."""
+MOST_UNCERTAIN = 6
+"""Numbers of a robot."""
+_CASE = re.compile(r"(free|high|low)[-+]?(/[0-9]{1,3}(,[0-9]{1,3})*)?")
 _DOUBLE = re.compile(r"-?0x[01](\.[0-9a-f]{1,13})?p[+-][0-9]{1,4}")
 
 
@@ -78,6 +87,20 @@ class Node(NamedTuple):
         """Nested lists of numbers."""
         return [node.array(*shape[1:]) for node in self.items(shape[0])] if shape else self.number()
 
+    def text(self) -> str:
+        self.require(isinstance(self.value, str) and len(self.value) <= LONGEST_NAME, "must be a short text")
+        return self.value
+
+    def texts(self, count: int | None = None, at_least: int = 0) -> tuple[str, ...]:
+        return tuple(node.text() for node in self.items(count, at_least))
+
+    def named(self) -> "list[tuple[str, Node]]":
+        """The entries of an object whose keys are names."""
+        self.require(isinstance(self.value, dict), "must be an object")
+        return [
+            (Node(self.place, name).text(), Node(f"{self.place}.{name}", value)) for name, value in self.value.items()
+        ]
+
     def symmetric(self, rows: int) -> list[list]:
         """A symmetric matrix, of which the file has the upper triangle row by row."""
         c = iter(node.number() for node in self.items(rows * (rows + 1) // 2))
@@ -95,35 +118,140 @@ def digest(value: Any) -> str:
 
 
 def read_claim(node: Node) -> Claim:
-    names = ("plant", "parameters", "state_limits", "dt", "x", "rates", "u", "K", "x_goal", "K_goal", "start")
-    entries = dict(zip(names, node.keys(*names), strict=True))
+    """A claim of either version: one of version 1 names its robot."""
+    if isinstance(node.value, dict) and "plant" in node.value:
+        return _read_claim_1(node)
+    names = ("robot", "parameters", "limit", "disturbance", "noise", "age", "speed", *_LOOP, "push")
+    entries: dict[str, Node] = dict(zip(names, node.keys(*names), strict=True))
+    node.require_digests()
+    robot = read_robot(entries["robot"])
+    parameters = {name: _range(value) for name, value in entries["parameters"].named()}
+    used = {name for function in _functions(robot) for term in function for name, _ in term.powers}
+    entries["parameters"].require(parameters.keys() == used, f"must be the robot's, {', '.join(sorted(used))[:80]}")
+    entries["parameters"].require(
+        sum(low < high for low, high in parameters.values()) <= MOST_UNCERTAIN,
+        f"has more than {MOST_UNCERTAIN} uncertain numbers",
+    )
+    limits = _range(entries["limit"])
+    entries["limit"].require(limits[0] > 0, "must be > 0")
+    require(
+        mass_is_definite(robot, parameters), f"{node.place}.robot.mass", "its determinant is not shown to be positive"
+    )
+    n = len(robot.states)
+    return _claim(
+        entries,
+        derive(robot),
+        parameters,
+        limits,
+        disturbance=_at_least_zero(entries["disturbance"]),
+        noise=[_at_least_zero(each) for each in entries["noise"].items(n)],
+        age=_at_least_zero(entries["age"]),
+        speed=_at_least_zero(entries["speed"]),
+        push=_at_least_zero(entries["push"]),
+    )
+
+
+_LOOP = ("state_limits", "dt", "x", "rates", "u", "K", "x_goal", "K_goal", "start")
+
+
+def _read_claim_1(node: Node) -> Claim:
+    names = ("plant", "parameters", *_LOOP)
+    entries: dict[str, Node] = dict(zip(names, node.keys(*names), strict=True))
     node.require_digests()
     entries["plant"].require(entries["plant"].value in tuple(PLANTS), f"must be one of {', '.join(PLANTS)}")
     plant = PLANTS[entries["plant"].value]
-    n = len(plant.states)
     given = entries["parameters"]
     given.require(isinstance(given.value, dict) and given.value.keys() == set(plant.parameters), "must be the plant's")
     parameters = {name: Node(f"{given.place}.{name}", given.value[name]).number() for name in plant.parameters}
     for name, value in parameters.items():
-        must = ">= 0" if name in ("b", "Beq", "Bp") else "> 0"
+        must = ">= 0" if name in plant.at_least_zero else "> 0"
         holds = value >= 0 if must == ">= 0" else value > 0
         require(holds, f"{given.place}.{name}", f"= {rounded(value):g}: must be {must}")
-    limits = entries["state_limits"].items(n)
-    bounds = [None if limit.value is None else limit.number() for limit in limits]
+    limit = parameters.pop(plant.limit)
+    exact = {name: (value, value) for name, value in parameters.items()}
+    nothing, noise = Q(0), [Q(0)] * len(plant.robot.states)
+    return _claim(
+        entries, derive(plant.robot), exact, (limit, limit), disturbance=nothing, noise=noise, age=nothing,
+        speed=nothing, push=nothing,
+    )  # fmt: skip
+
+
+def _claim(entries: Mapping[str, Node], equations: Equations, parameters, limits, **acts: Any) -> Claim:
+    """With the closed loop, which both versions state alike."""
+    n = len(equations.robot.states)
+    bounds = [None if limit.value is None else limit.number() for limit in entries["state_limits"].items(n)]
     dt = entries["dt"].number()
     entries["dt"].require(dt > 0, "must be > 0")
     knots = len(entries["x"].items(at_least=2))
     start = entries["start"].items(2)
     return Claim(
-        plant, parameters, parameters[plant.limit], bounds, dt,
-        entries["x"].array(knots, n), entries["rates"].array(knots - 1, 2, n), entries["u"].array(knots - 1),
-        entries["K"].array(knots, n), entries["x_goal"].array(n), entries["K_goal"].array(n),
-        (start[0].integer(0, knots - 1), start[1].number()),
+        equations, parameters, limits, bounds=bounds, dt=dt, x=entries["x"].array(knots, n),
+        rates=entries["rates"].array(knots - 1, 2, n), u=entries["u"].array(knots - 1), K=entries["K"].array(knots, n),
+        x_goal=entries["x_goal"].array(n), K_goal=entries["K_goal"].array(n),
+        start=(start[0].integer(0, knots - 1), start[1].number()), **acts,
     )  # fmt: skip
 
 
+def _at_least_zero(node: Node) -> Any:
+    value = node.number()
+    node.require(value >= 0, "must be >= 0")
+    return value
+
+
+def _range(node: Node) -> tuple[Any, Any]:
+    """The least and the largest value."""
+    low, high = node.array(2)
+    node.require(low <= high, "must rise")
+    return low, high
+
+
+def _functions(robot: Robot) -> Iterator[Function]:
+    yield from (entry for row in robot.mass for entry in row)
+    yield from (robot.potential, *robot.damping, *robot.motor)
+
+
+def read_robot(node: Node) -> Robot:
+    """A robot in its own words."""
+    entries = node.keys("name", "states", "units", "input_unit", "joints", "mass", "potential", "damping", "motor")
+    node.require_digests()
+    name, states, units, input_unit, joints, mass, potential, damping, motor = entries
+    kinds = joints.texts(at_least=1)
+    count = len(kinds)
+    joints.require(set(kinds) <= {HINGE, SLIDE}, f"must be {HINGE} or {SLIDE}")
+    joints.require(count <= MOST_JOINTS, f"has {count} entries, must have at most {MOST_JOINTS}")
+    rows = [row.items(i + 1) for i, row in enumerate(mass.items(count))]
+
+    def constants(each: Node) -> tuple[Function, ...]:
+        found = tuple(_read_function(entry, count) for entry in each.items(count))
+        each.require(not any(any(term.joints) for function in found for term in function), "must not move")
+        return found
+
+    return Robot(
+        name.text(), states.texts(2 * count), units.texts(2 * count), input_unit.text(), kinds,
+        tuple(tuple(_read_function(entry, count) for entry in row) for row in rows),
+        _read_function(potential, count), constants(damping), constants(motor),
+    )  # fmt: skip
+
+
+def _read_function(node: Node, joints: int) -> Function:
+    terms = node.items()
+    node.require(len(terms) <= MOST_TERMS_OF_ROBOT, f"must have at most {MOST_TERMS_OF_ROBOT} terms")
+    return tuple(_read_term(term, joints) for term in terms)
+
+
+def _read_term(node: Node, joints: int) -> Term:
+    node.require(isinstance(node.value, dict) and node.value.keys() == {"joints", "powers", "cos", "sin"},
+                 "must have joints, powers, cos and sin")  # fmt: skip
+    at, powers, cosine, sine = (
+        Node(f"{node.place}.{key}", node.value[key]) for key in ("joints", "powers", "cos", "sin")
+    )
+    places = tuple(each.integer(-HIGHEST, HIGHEST) for each in at.items(joints))
+    by_name = tuple(sorted((name, power.integer(1, HIGHEST)) for name, power in powers.named()))
+    return Term(places, by_name, cosine.number(), sine.number())
+
+
 def read_cases(node: Node, n: int) -> dict[str, GramCertificate]:
-    node.require(isinstance(node.value, dict) and node.value.keys() <= {"free", "high", "low"}, "must be cases")
+    node.require(isinstance(node.value, dict) and all(map(_CASE.fullmatch, node.value)), "must be cases")
     cases = {}
     for case, value in node.value.items():
         here = Node(f"{node.place}.{case}", value)
@@ -174,11 +302,26 @@ def _read_shell(node: Node, n: int) -> Shell:
     return shell
 
 
-def read_goal(node: Node, claim: Claim) -> tuple[list, int, Any, list[Shell]]:
-    """Axes, order of the Taylor models, weight of the S-lemma, and the shells. These cover the levels [0, 1]."""
-    axes, order, weight, items = node.keys("axes", "order", "weight", "shells")
-    shells, reached = [_read_shell(item, claim.n) for item in items.items(at_least=1)], Q(0)
+class Goal(NamedTuple):
+    """Axes of the goal region, order of its Taylor models, weight of the S-lemma; the shells cover [rest, 1]."""
+
+    axes: list
+    order: int
+    weight: Any
+    rest: Any
+    shells: list[Shell]
+
+
+def read_goal(node: Node, claim: Claim) -> Goal:
+    """The goal region; that of a file of version 1 has no `rest`, and its shells begin at 0."""
+    names = ("axes", "order", "weight", "shells")
+    ended = isinstance(node.value, dict) and "rest" in node.value
+    axes, order, weight, items, *others = node.keys(*names, *(("rest",) if ended else ()))
+    rest = others[0].number() if ended else Q(0)
+    shells, reached = [_read_shell(item, claim.n) for item in items.items(at_least=1)], rest
     node.require_digests()
+    if claim.moves_the_goal:
+        node.require(rest > 0, "must have a rest > 0: what acts on the robot moves it at the goal")
     for i, shell in enumerate(shells):
         place = f"{items.place}[{i}]"
         require(
@@ -187,7 +330,7 @@ def read_goal(node: Node, claim: Claim) -> tuple[list, int, Any, list[Shell]]:
         reached = shell.end
     items.require(reached == 1, f"ends at {rounded(reached):g}, must end at 1")
     require_few_terms(order, claim.n, MAX_ORDER, order.integer(2, MAX_ORDER - 2))
-    return axes.array(claim.n, claim.n), order.value, weight.number(), shells
+    return Goal(axes.array(claim.n, claim.n), order.value, weight.number(), rest, shells)
 
 
 def read_notes(node: Node) -> dict[str, str]:

@@ -1,20 +1,26 @@
-"""The obligations of one interval of the funnel: d/dt |y|^2 < 0 on |y| = 1, for every case of the saturation."""
+"""The obligations of one interval of the funnel: d/dt |y|^2 < 0 on |y| = 1, for every robot and case of the input."""
 
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 from rtcd_jax.certificate.check.claim import Claim
 from rtcd_jax.certificate.check.exact import Q, alternating, near, require, rounded
 from rtcd_jax.certificate.check.matrix import cofactors, dot
-from rtcd_jax.certificate.check.squares import GramCertificate, Obligation, is_positive
-from rtcd_jax.certificate.check.taylor import Space, Taylor, derivative, sine_and_cosine, size
+from rtcd_jax.certificate.check.saturation import Case, cases_of, input_error
+from rtcd_jax.certificate.check.squares import GramCertificate, Obligation, control_points, is_positive
+from rtcd_jax.certificate.check.taylor import Taylor, polynomial, sine_and_cosine, terms_of
+
+WHOLE = {0: (Q(-1), Q(1))}
+"""s on an interval."""
 
 
 class Motion(NamedTuple):
-    """One interval's data as polynomials in s: x*, x*' [1/s], K, u, L and L' [1/s]."""
+    """One interval's data as polynomials in s: x*, x*' [1/s], K, K' [1/s], u, L and L' [1/s]."""
 
     state: list
     rate: list
     gain: list
+    gain_rate: list
     input: Any
     axes: list
     axes_rate: list
@@ -36,7 +42,7 @@ class Interval(NamedTuple):
 
 def motion(claim: Claim, interval: Interval) -> Motion:
     """The closed loop's and the funnel's data on one interval."""
-    k, dt, n, space = interval.knot, claim.dt, claim.n, Space(claim.n, *interval.orders)
+    k, dt, space = interval.knot, claim.dt, claim.space(*interval.orders)
     half = (interval.end - interval.start) / 2
     fraction = space.s * half + space.poly((interval.start + interval.end) / 2)  # of the knots' interval, at s
     speed = 1 / (dt * half)  # ds/dt
@@ -51,56 +57,85 @@ def motion(claim: Claim, interval: Interval) -> Motion:
         for a, b, c, d in zip(first, last, bend0, bend1, strict=True):
             row.append(space.compose([(a + b) / 2 + c, (b - a) / 2 + d, -c, -d], space.s))
         axes.append(row)
-    rate = [derivative(n, a) * speed for a in state]
-    axes_rate = [[derivative(n, a) * speed for a in row] for row in axes]
-    return Motion(state, rate, gain, claim.u[k], axes, axes_rate, 2 / speed)
+    rate, gain_rate = ([space.derivative(a) * speed for a in each] for each in (state, gain))
+    axes_rate = [[space.derivative(a) * speed for a in row] for row in axes]
+    return Motion(state, rate, gain, gain_rate, claim.u[k], axes, axes_rate, 2 / speed)
 
 
 def funnel_obligations(claim: Claim, interval: Interval, place: str) -> dict[str, Obligation]:
-    """By case of the saturation: "free", "high" (u = F), "low" (u = -F); those that cannot occur are left out."""
-    data, space = motion(claim, interval), Space(claim.n, *interval.orders)
+    """By case of the input and, behind a slash, control point of the robots."""
+    data, space = motion(claim, interval), claim.space(*interval.orders)
     adjugate, determinant = cofactors(data.axes)
-    require(is_positive(determinant, Q(-1), Q(1)), place, "an ellipsoid is degenerate: det L must be > 0")
+    require(is_positive(determinant, WHOLE), place, "an ellipsoid is degenerate: det L must be > 0")
+    if claim.age != 0:
+        require_speed(claim, funnel_speed(claim, interval, place), place)
     y = [space.y(i) for i in range(claim.n)]
     error = [dot(row, y) for row in data.axes]
     x = [Taylor(space, center + e).tidy() for center, e in zip(data.state, error, strict=True)]
-    center, _ = near(x[claim.plant.angle].constant, 20)
-    require(abs(center) <= 64, place, "the nominal angle is beyond 64 rad")
-    values = alternating(center, 1), alternating(center, 0)
-    field = field_of(claim, x, center, (values[0][0], values[1][0], values[0][1]), place)
+    field = field_of(claim, x, waves_near(claim, x, place), place)
     scaled = [dot(column, y) for column in zip(*adjugate, strict=True)]
     push = pushes(field, scaled, Taylor(space, determinant).constant)
     drag = [Taylor(space, a + dot(row, y)).tidy() for a, row in zip(data.rate, data.axes_rate, strict=True)]
-    free = pushed(push, [a - field.d * slow for a, slow in zip(field.a, drag, strict=True)])
-    forced = pushed(push, field.b)
+    relative = [a - field.d * slow for a, slow in zip(field.a, drag, strict=True)]
+    free, forced = pushed(push, relative), pushed(push, field.b)
     linear = dot(data.gain, error) * Q(-1)
     by_axis = [dot(data.gain, column) for column in zip(*data.axes, strict=True)]
-    where = cases_of(space, claim.limit, data.input, linear, dot(by_axis, by_axis), Q(-1), Q(1))
-    inputs = {"free": space.poly(data.input) + linear, "high": claim.limit, "low": -claim.limit}
+    late = input_error(claim, interval.knot)
     obligations = {}
-    for case, conditions in where.items():
-        u = inputs[case]
-        total = (free + forced * (Taylor(free.space, u) if case == "free" else u)) * Q(-1)
-        obligations[case] = Obligation(total.p, total.r + total.d, Q(0), conditions, Q(-1), Q(1))
+    for name, case in cases_of(space, claim, late, data.input, linear, dot(by_axis, by_axis), Q(-1), Q(1)).items():
+        total = (free + forced * Taylor(free.space, case.input)) * Q(-1)
+        obligations |= for_all_robots(name, case, total.p, total.r + total.d, Q(0), WHOLE[0], claim)
     return obligations
 
 
+def for_all_robots(
+    name: str, case: Case, p, error, drift, span: tuple[Any, Any], claim: Claim
+) -> dict[str, Obligation]:
+    """The obligations of a case, that of every control point of the robots; p may be a polynomial in their numbers."""
+    where = [_without_robot(condition, claim.n) for condition in case.where]
+    return {
+        f"{name}/{point}" if point else name: Obligation(part, error, drift, where, *span)
+        for point, part in control_points(p, claim.n).items()
+    }
+
+
+def _without_robot(p, n: int) -> Any:
+    return polynomial(n, {e[: n + 1]: c for e, c in terms_of(p)})
+
+
 class Field(NamedTuple):
-    """D, a and b of the robot on an ellipsoid, Taylor models."""
+    """D, a and b of the robots on an ellipsoid, Taylor models."""
 
     d: Taylor
     a: list[Taylor]
     b: list[Taylor]
 
 
-def field_of(claim: Claim, x: list[Taylor], center, values: tuple, place: str) -> Field:
-    """At the states x, whose angle is near `center`, with the sine and cosine and the bound of their errors there."""
-    sine, cosine = sine_and_cosine(x[claim.plant.angle], center, values, place)
-    d, a, b = claim.plant.field(claim.parameters, x, sine, cosine)
-    require(
-        2 * d.constant - size(d.p) - d.r - d.d > 0, place, "the mass matrix' determinant is not shown to be positive"
-    )
-    return Field(d, a, b)
+def field_of(claim: Claim, x: list[Taylor], values: Mapping[tuple[int, ...], tuple[Any, tuple]], place: str) -> Field:
+    """At the states x.
+
+    `values` has for every wave k an angle near k.q, and its sine and cosine with the bound of their errors.
+    """
+    space = x[0].space
+    waves = {k: sine_and_cosine(angle_of(k, x), center, known, place) for k, (center, known) in values.items()}
+    d, a, b = claim.equations.field(claim.numbers(space), x, waves)
+    return Field(space.enclose(d), [space.enclose(each) for each in a], [space.enclose(each) for each in b])
+
+
+def angle_of(k: tuple[int, ...], x: list) -> Any:
+    """k.q."""
+    return dot([x[i] for i, a in enumerate(k) if a], [Q(a) for a in k if a])
+
+
+def waves_near(claim: Claim, x: list[Taylor], place: str) -> dict[tuple[int, ...], tuple[Any, tuple]]:
+    """For `field_of`, about the middle of the states x."""
+    values = {}
+    for k in claim.equations.waves:
+        center, _ = near(angle_of(k, x).constant, 20)
+        require(abs(center) <= 64, place, "the nominal angle is beyond 64 rad")
+        sine, cosine = alternating(center, 1), alternating(center, 0)
+        values[k] = center, (sine[0], cosine[0], sine[1])
+    return values
 
 
 def pushes(field: Field, scaled: list, determinant) -> list[Taylor]:
@@ -115,17 +150,27 @@ def pushed(push: list[Taylor], field: list[Taylor]) -> Taylor:
     return dot(push, [Taylor(push[0].space, f.p, f.r, f.d) for f in field])
 
 
-def cases_of(space: Space, limit, feedforward, linear, bound_squared, low, high) -> dict[str, list]:
-    """What is >= 0 where u = feedforward + linear is free, too high, too low.
+def funnel_speed(claim: Claim, interval: Interval, place: str) -> Any:
+    """An upper bound of |d/dt (K e)| in the ellipsoids of an interval, e = x - x*."""
+    data, space = motion(claim, interval), claim.space(*interval.orders)
+    error = [dot(row, [space.y(i) for i in range(claim.n)]) for row in data.axes]
+    x = [Taylor(space, center + e).tidy() for center, e in zip(data.state, error, strict=True)]
+    field = field_of(claim, x, waves_near(claim, x, place), place)
+    rate = [a - field.d * Taylor(space, slow) for a, slow in zip(field.a, data.rate, strict=True)]
+    turning = dot([Taylor(space, gain) for gain in data.gain_rate], [Taylor(space, e) for e in error])
+    return turning.largest + speed_of(claim, field, [Taylor(space, gain) for gain in data.gain], rate, place)
 
-    |linear|^2 <= bound_squared on the sphere.
-    """
-    clearance = {"high": space.poly(limit - feedforward) - linear, "low": space.poly(limit + feedforward) + linear}
-    occurs = []
-    for case, left in (("high", limit - feedforward), ("low", limit + feedforward)):
-        if not (left > 0 and is_positive(space.poly(left * left) - bound_squared, low, high, depth=4)):
-            occurs.append(case)
-    return {"free": [clearance[case] for case in occurs], **{case: [clearance[case] * Q(-1)] for case in occurs}}
+
+def speed_of(claim: Claim, field: Field, gain: list[Taylor], rate: list[Taylor], place: str) -> Any:
+    """An upper bound of |K e'|, where `rate` is D e' without the input's part."""
+    least, largest_input = field.d.least, claim.limits[1] + claim.disturbance
+    require(least > 0, place, "the mass matrix' determinant is not shown to be positive here")
+    return (dot(gain, rate).largest + dot(gain, field.b).largest * largest_input) / least
+
+
+def require_speed(claim: Claim, fastest: Any, place: str) -> None:
+    told = f"the feedback may change by {rounded(fastest):.6g} {claim.robot.input_unit}/s, by more than claim.speed"
+    require(fastest <= claim.speed, place, told)
 
 
 def require_bounds(claim: Claim, data: Motion, place: str) -> None:
@@ -134,8 +179,8 @@ def require_bounds(claim: Claim, data: Motion, place: str) -> None:
         if bound is None:
             continue
         for sign in (1, -1):
-            left = data.state[i] * Q(sign) + Space(claim.n, 0, 0).poly(bound)
+            left = data.state[i] * Q(sign) + claim.space(0, 0).poly(bound)
             clearance = left * left - dot(data.axes[i], data.axes[i])
-            inside = is_positive(left, Q(-1), Q(1)) and is_positive(clearance, Q(-1), Q(1))
-            name = claim.plant.states[i]
-            require(inside, place, f"the limit |{name}| <= {rounded(bound):.6g} {claim.plant.units[i]} is not kept")
+            inside = is_positive(left, WHOLE) and is_positive(clearance, WHOLE)
+            name = claim.robot.states[i]
+            require(inside, place, f"the limit |{name}| <= {rounded(bound):.6g} {claim.robot.units[i]} is not kept")

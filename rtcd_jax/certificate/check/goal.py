@@ -4,11 +4,24 @@ import math
 from typing import Any, NamedTuple
 
 from rtcd_jax.certificate.check.claim import Claim
-from rtcd_jax.certificate.check.exact import MAX_ORDER, PI, PI_ERROR, Q, require
-from rtcd_jax.certificate.check.funnel import cases_of, field_of, pushed, pushes
+from rtcd_jax.certificate.check.exact import MAX_ORDER, PI, PI_ERROR, Q, require, rounded
+from rtcd_jax.certificate.check.funnel import (
+    Field,
+    angle_of,
+    field_of,
+    for_all_robots,
+    pushed,
+    pushes,
+    require_speed,
+    speed_of,
+)
 from rtcd_jax.certificate.check.matrix import cofactors, dot
+from rtcd_jax.certificate.check.saturation import cases_of, error_under
 from rtcd_jax.certificate.check.squares import GramCertificate, Obligation, is_positive_definite
-from rtcd_jax.certificate.check.taylor import Space, Taylor, polynomial, terms_of
+from rtcd_jax.certificate.check.taylor import Taylor, terms_of
+
+MOST_TURNS = 10**6
+"""Largest angle [rad] of a goal."""
 
 
 class Shell(NamedTuple):
@@ -19,40 +32,72 @@ class Shell(NamedTuple):
     cases: dict[str, GramCertificate]
 
 
-def goal_field(claim: Claim, axes: list, y_order: int, place: str) -> tuple[Taylor, Taylor, list]:
+class GoalField(NamedTuple):
     """2 y' adj(L) a / l and 2 y' adj(L) b / l as Taylor models in (l, z) after y = l z, and K L."""
-    space = Space(claim.n, MAX_ORDER, y_order)
+
+    free: Taylor
+    forced: Taylor
+    gain: list
+
+
+def goal_field(claim: Claim, axes: list, y_order: int, place: str) -> GoalField:
+    """The goal region's, which is {x_g + axes y : |y| <= 1}."""
     adjugate, determinant = cofactors(axes)
     require(determinant > 0, place, "the ellipsoid is degenerate: det L must be > 0")
-    z = [space.y(i) for i in range(claim.n)]
-    center = claim.x_goal[claim.plant.angle]
-    turns = round(float(center) / math.pi)
-    off = abs(center - PI * turns) + PI_ERROR * abs(turns)
-    require(off < Q(1, 10**9), place, "the goal's angle is no multiple of pi")
-    x = [Taylor(space, space.poly(c) + dot(z, row) * space.s) for c, row in zip(claim.x_goal, axes, strict=True)]
-    field = field_of(claim, x, center, (Q(0), Q(-1 if turns % 2 else 1), off / 3), place)
-    require(all(f.constant == 0 for f in field.a), place, "the goal is no equilibrium")
+    if claim.age != 0:
+        require_speed(claim, goal_speed(claim, axes, y_order, place), place)
+    field = _field_at_goal(claim, axes, y_order, place)
+    z = [field.d.space.y(i) for i in range(claim.n)]
+    still = all(any(e[: claim.n + 1]) for f in field.a for e, _ in terms_of(f.p))
+    require(still, place, "the goal is no equilibrium")
     push = pushes(field, [dot(z, column) for column in zip(*adjugate, strict=True)], determinant)
     gain = [dot(claim.K_goal, column) for column in zip(*axes, strict=True)]
-    return pushed(push, field.a), pushed(push, field.b), gain
+    return GoalField(pushed(push, field.a), pushed(push, field.b), gain)
 
 
-def goal_obligations(claim: Claim, field: tuple[Taylor, Taylor, list], low, high) -> dict[str, Obligation]:
-    """As `funnel_obligations`, in l on [low, high]: q / l^2 where u is free, q / l where it is saturated."""
+def _field_at_goal(claim: Claim, axes: list, y_order: int, place: str) -> Field:
+    """In (l, z)."""
+    space = claim.space(MAX_ORDER, y_order)
+    z = [space.y(i) for i in range(claim.n)]
+    x = [Taylor(space, space.poly(c) + dot(z, row) * space.s) for c, row in zip(claim.x_goal, axes, strict=True)]
+    return field_of(claim, x, waves_at_goal(claim, place), place)
+
+
+def goal_speed(claim: Claim, axes: list, y_order: int, place: str) -> Any:
+    """An upper bound of |K x'| in the goal region."""
+    field = _field_at_goal(claim, axes, y_order, place)
+    return speed_of(claim, field, [field.d.space.enclose(gain) for gain in claim.K_goal], field.a, place)
+
+
+def waves_at_goal(claim: Claim, place: str) -> dict[tuple[int, ...], tuple[Any, tuple]]:
+    """For `field_of`: angles at the goal are multiples of pi, rounded to doubles."""
+    values = {}
+    for k in claim.equations.waves:
+        center = angle_of(k, claim.x_goal)
+        turns = round(rounded(center) / math.pi) if abs(center) < MOST_TURNS else 0
+        off = abs(center - PI * turns) + PI_ERROR * abs(turns)
+        require(off < Q(1, 10**9), place, "the goal's angle is no multiple of pi")
+        values[k] = center, (Q(0), Q(-1 if turns % 2 else 1), off / 3)
+    return values
+
+
+def goal_obligations(claim: Claim, field: GoalField, low, high) -> dict[str, Obligation]:
+    """As `funnel_obligations`, in l on [low, high]: q / l where u is saturated or the goal is moved, else q / l^2."""
     free, forced, gain = field
     space = free.space
     linear = dot([space.y(j) for j in range(claim.n)], gain) * Q(-1)
     bound_squared = space.s * space.s * dot(gain, gain)
     obligations = {}
-    for case, conditions in cases_of(space, claim.limit, Q(0), linear * space.s, bound_squared, low, high).items():
-        if case == "free":
-            lowered = polynomial(claim.n, {(e[0] - 1, *e[1:]): c for e, c in terms_of(free.p)})
+    late = error_under(claim, [claim.K_goal])
+    for name, case in cases_of(space, claim, late, Q(0), linear * space.s, bound_squared, low, high).items():
+        if case.saturated or claim.moves_the_goal:
+            held = free + forced * Taylor(space, case.input)
+            p, error, drift = held.p * Q(-1), held.r * high + held.d, Q(0)
+        else:
+            lowered = space.polynomial({(e[0] - 1, *e[1:]): c for e, c in terms_of(free.p)})
             held = forced * Taylor(space, linear)
             p, error, drift = (lowered + held.p) * Q(-1), free.r + held.r + held.d, free.d
-        else:
-            held = free + forced * (claim.limit if case == "high" else -claim.limit)
-            p, error, drift = held.p * Q(-1), held.r + held.d, Q(0)
-        obligations[case] = Obligation(p, error, drift, conditions, low, high)
+        obligations |= for_all_robots(name, case, p, error, drift, (low, high), claim)
     return obligations
 
 

@@ -12,7 +12,9 @@ def dot(a: Iterable, b: Iterable) -> Any:
 
 
 def cofactors(m: list[list]) -> tuple[list[list], Any]:
-    """The adjugate and the determinant of a matrix with two rows or more."""
+    """The adjugate and the determinant of a matrix."""
+    if len(m) == 1:
+        return [[1]], m[0][0]
 
     def determinant(rows: tuple[int, ...], columns: tuple[int, ...]) -> Any:
         first = m[rows[0]]

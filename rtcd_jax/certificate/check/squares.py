@@ -1,13 +1,14 @@
 """Positive on the sphere: a sum of squares in exact numbers, by Bernstein polynomials in the time."""
 
+import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import lru_cache
 from itertools import combinations_with_replacement
 from typing import Any, NamedTuple
 
 from rtcd_jax.certificate.check.exact import Q, require, rounded
-from rtcd_jax.certificate.check.taylor import peak, terms_of
+from rtcd_jax.certificate.check.taylor import peak, polynomial, terms_of
 
 
 class Obligation(NamedTuple):
@@ -159,15 +160,48 @@ def _subtract_product(parts, g, multiplier, basis, todo: Obligation, place: str)
                         part[h] = part.get(h, 0) - weight * c * d * k
 
 
-def is_positive(p, low, high, depth: int = 10) -> bool:
-    """Whether a polynomial in s is shown to be positive on [low, high], by Bernstein coefficients and bisection."""
-    by_power = {e[0]: c for e, c in terms_of(p)}
-    degree = max(by_power, default=0)
-    rows = _basis_change(degree, degree, low, high)
-    values = [sum((c * rows[k][j] for k, c in by_power.items()), Q(0)) for j in range(degree + 1)]
-    if min(values) > 0:
+def is_positive(p, box: Mapping[int, tuple[Any, Any]], depth: int = 10) -> bool:
+    """Whether a polynomial is shown to be positive on a box, by Bernstein coefficients and bisection.
+
+    `box` has the ends of its variables by their place among the exponents; p has no others.
+    """
+    terms, degrees, widest = dict(terms_of(p)), [], None
+    for i, (low, high) in box.items():
+        degrees.append(max((e[i] for e in terms), default=0))
+        terms = _in_bernstein(terms, i, degrees[-1], low, high)
+        if degrees[-1] and (widest is None or high - low > box[widest][1] - box[widest][0]):
+            widest = i
+    values = {tuple(e[i] for i in box): c for e, c in terms.items()}
+    if len(values) == math.prod(degree + 1 for degree in degrees) and min(values.values()) > 0:
         return True
-    if depth == 0 or values[0] <= 0 or values[-1] <= 0:
+    corners = itertools.product(*({0, degree} for degree in degrees))
+    if widest is None or depth == 0 or any(values.get(corner, 0) <= 0 for corner in corners):
         return False
+    low, high = box[widest]
     middle = (low + high) / 2
-    return is_positive(p, low, middle, depth - 1) and is_positive(p, middle, high, depth - 1)
+    return all(is_positive(p, {**box, widest: half}, depth - 1) for half in ((low, middle), (middle, high)))
+
+
+def _in_bernstein(terms: Mapping[tuple[int, ...], Any], i: int, degree: int, low, high) -> dict:
+    """The coefficients with the powers of the variable i replaced by Bernstein polynomials of a degree."""
+    rows, total = _basis_change(degree, degree, low, high), {}
+    for e, c in terms.items():
+        for j, weight in enumerate(rows[e[i]]):
+            if weight != 0:
+                place = (*e[:i], j, *e[i + 1 :])
+                total[place] = total.get(place, 0) + c * weight
+    return total
+
+
+def control_points(p, n: int) -> dict[str, Any]:
+    """Polynomials in (s, y [n]) whose mean, by the Bernstein weights of the robot, is p; each by its place, "" where
+    there is one robot.
+    """
+    terms, degrees = dict(terms_of(p)), []
+    for i in range(n + 1, len(next(iter(terms), (0,) * (n + 1)))):
+        degrees.append(max(e[i] for e in terms))
+        terms = _in_bernstein(terms, i, degrees[-1], Q(-1), Q(1))
+    points = {place: {} for place in itertools.product(*(range(degree + 1) for degree in degrees))}
+    for e, c in terms.items():
+        points[e[n + 1 :]][e[: n + 1]] = c
+    return {",".join(map(str, place)): polynomial(n, point) for place, point in points.items()}

@@ -1,4 +1,7 @@
-"""Taylor models: functions of time and of a point in the unit ball as polynomials with bounds of their remainders."""
+"""Taylor models: functions of time, of a point in the unit ball and of a robot as polynomials with remainders' bounds.
+
+The robot is a point p of the cube |p_i| <= 1: its uncertain numbers, each between its bounds.
+"""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -7,7 +10,7 @@ from typing import Any, NamedTuple
 
 from rtcd_jax.certificate.check.exact import BITS, Q, flint, near, require, root_up, up
 
-# Polynomials in (s, y_1 .. y_n) ---------------------------------------------------------------------------------------
+# Polynomials in (s, y_1 .. y_n, p_1 .. p_m) ---------------------------------------------------------------------------
 
 
 class Sparse:
@@ -40,14 +43,14 @@ class Sparse:
 
 
 @lru_cache
-def _ring(n: int) -> Any:
-    names = ["s", *(f"y{i}" for i in range(n))]
+def _ring(others: int) -> Any:
+    names = ["s", *(f"y{i}" for i in range(others))]
     return flint.fmpq_mpoly_ctx.get(names, flint.Ordering.degrevlex)  # pyright: ignore[reportOptionalMemberAccess]
 
 
-def polynomial(n: int, terms: Mapping[tuple[int, ...], Any]) -> Any:
-    """The polynomial with these coefficients by exponents (of s, y_1 .. y_n)."""
-    return _ring(n).from_dict(dict(terms)) if flint else Sparse(terms)
+def polynomial(others: int, terms: Mapping[tuple[int, ...], Any]) -> Any:
+    """The polynomial with these coefficients by exponents, of s and so many other variables."""
+    return _ring(others).from_dict(dict(terms)) if flint else Sparse(terms)
 
 
 def terms_of(p) -> list[tuple[tuple[int, ...], Any]]:
@@ -62,21 +65,13 @@ def peak(exponents: tuple[int, ...]):
     return root_up(square) if total and max(exponents) < total else Q(1)
 
 
-def derivative(n: int, p) -> Any:
-    """In s."""
-    return polynomial(n, {(e[0] - 1, *e[1:]): c * e[0] for e, c in terms_of(p) if e[0]})
-
-
-def size(p):
-    """An upper bound of |p| for |s| <= 1, |y| <= 1."""
-    return up(sum((abs(c) * peak(e[1:]) for e, c in terms_of(p)), Q(0)))
-
-
 # Taylor models --------------------------------------------------------------------------------------------------------
 
 
 class Taylor:
-    """A function of (s, y) within d + r s of the polynomial p, for |y| <= 1; s = l at the goal, 1 along a funnel."""
+    """A function of (s, y, robot) within d + r s of the polynomial p, for |y| <= 1 and all robots; s = l at the goal,
+    1 along a funnel.
+    """
 
     __slots__ = ("d", "p", "r", "space")
 
@@ -98,39 +93,69 @@ class Taylor:
             return Taylor(self.space, self.p * other, self.r * abs(other), self.d * abs(other))
         r = d = Q(0)
         if self.r != 0 or self.d != 0 or other.r != 0 or other.d != 0:
-            a, b = size(self.p), size(other.p)
+            a, b = self.space.size(self.p), self.space.size(other.p)
             r = a * other.r + b * self.r + self.r * (other.r + other.d) + self.d * other.r
             d = a * other.d + b * self.d + self.d * other.d
         return Taylor(self.space, self.p * other.p, r, d).tidy()
 
+    __rmul__ = __mul__
+
     def tidy(self) -> "Taylor":
-        """The same function without terms of high order, its coefficients rounded."""
-        terms, r, d = {}, self.r, self.d
+        """The same function without terms of high order in s and y, its coefficients rounded."""
+        terms, r, d, n = {}, self.r, self.d, self.space.n
         for e, c in terms_of(self.p):
-            order = sum(e[1:])
+            order = sum(e[1 : n + 1])
             if e[0] > self.space.s_order or order > self.space.y_order:
                 coefficient, error = Q(0), abs(c)
             else:
                 coefficient, error = near(c)
             if error != 0 and order:
-                r += error * peak(e[1:])
+                r += error * peak(e[1 : n + 1])
             elif error != 0:
                 d += error
             if coefficient != 0:
                 terms[e] = coefficient
-        return Taylor(self.space, polynomial(self.space.n, terms), up(r), up(d))
+        return Taylor(self.space, self.space.polynomial(terms), up(r), up(d))
 
     @property
     def constant(self):
-        return self.p.to_dict().get((0,) * (self.space.n + 1), Q(0))
+        return self.p.to_dict().get(self.space.exponents(), Q(0))
+
+    @property
+    def least(self):
+        """A lower bound."""
+        return 2 * self.constant - self.space.size(self.p) - self.r - self.d
+
+    @property
+    def largest(self):
+        """An upper bound of its absolute value."""
+        return self.space.size(self.p) + self.r + self.d
 
 
 class Space(NamedTuple):
-    """Where Taylor models live: n components of y, and the orders in s and y above which terms go to the remainder."""
+    """Where Taylor models live: n components of y, the orders in s and y above which terms go to the remainder, and m
+    uncertain numbers p of the robot, whose powers all stay.
+    """
 
     n: int
     s_order: int
     y_order: int
+    m: int = 0
+
+    def exponents(self, s: int = 0, y: int | None = None, p: int | None = None) -> tuple[int, ...]:
+        """Of s^s, times the component y, times the component p."""
+        return (s, *(int(y == i) for i in range(self.n)), *(int(p == i) for i in range(self.m)))
+
+    def polynomial(self, terms: Mapping[tuple[int, ...], Any]) -> Any:
+        return polynomial(self.n + self.m, terms)
+
+    def derivative(self, p) -> Any:
+        """In s."""
+        return self.polynomial({(e[0] - 1, *e[1:]): c * e[0] for e, c in terms_of(p) if e[0]})
+
+    def size(self, p):
+        """An upper bound of |p| for |s| <= 1, |y| <= 1 and all robots."""
+        return up(sum((abs(c) * peak(e[1 : self.n + 1]) for e, c in terms_of(p)), Q(0)))
 
     def enclose(self, a: Any) -> Taylor:
         """A Taylor model of itself, of a polynomial or of a scalar."""
@@ -140,7 +165,7 @@ class Space(NamedTuple):
 
     def poly(self, a: Any):
         """The polynomial of a scalar."""
-        return polynomial(self.n, {(0,) * (self.n + 1): Q(a)} if a != 0 else {})
+        return self.polynomial({self.exponents(): Q(a)} if a != 0 else {})
 
     def compose(self, coefficients: Sequence, inner):
         """The polynomial with these coefficients of the powers of another one."""
@@ -151,10 +176,16 @@ class Space(NamedTuple):
 
     @property
     def s(self):
-        return polynomial(self.n, {(1, *(0,) * self.n): Q(1)})
+        return self.polynomial({self.exponents(1): Q(1)})
 
     def y(self, i: int):
-        return polynomial(self.n, {(0, *(int(i == j) for j in range(self.n))): Q(1)})
+        return self.polynomial({self.exponents(y=i): Q(1)})
+
+    def between(self, low, high, i: int) -> Taylor:
+        """The number that goes from `low` to `high` with p_i."""
+        return Taylor(
+            self, self.polynomial({self.exponents(): (low + high) / 2, self.exponents(p=i): (high - low) / 2})
+        )
 
 
 def economize(series: Sequence, radius, degree: int):
@@ -188,8 +219,8 @@ def sine_and_cosine(angle: Taylor, center, values: tuple, place: str) -> tuple[T
     """Of an angle near `center`, whose sine and cosine are `values` up to the third of them."""
     space = angle.space
     x = Taylor(space, angle.p - space.poly(center))
-    radius = up(size(x.p), 20)
-    require(0 < radius <= 8, place, "the funnel is wider than 8 rad")
+    radius = max(up(space.size(x.p), 20), Q(1, 1 << 20))
+    require(radius <= 8, place, "the funnel is wider than 8 rad")
     squared, tail = x * x, radius**_LONG / Q(math.factorial(_LONG + 1))
     parts = []
     for series, first in ((_SINE, 0), (_COSINE, 1)):

@@ -6,8 +6,9 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from rtcd_jax.certificate.check.claim import Claim
-from rtcd_jax.certificate.check.exact import Damaged, Q, Undecided, require, root_up, rounded
+from rtcd_jax.certificate.check.exact import Damaged, Q, Undecided, printable, require, root_up, rounded
 from rtcd_jax.certificate.check.file import (
+    Goal,
     Node,
     digest,
     parse,
@@ -20,10 +21,12 @@ from rtcd_jax.certificate.check.file import (
 from rtcd_jax.certificate.check.funnel import Interval, funnel_obligations, motion, require_bounds
 from rtcd_jax.certificate.check.goal import goal_field, goal_obligations, require_arrival
 from rtcd_jax.certificate.check.matrix import cofactors, dot
+from rtcd_jax.certificate.check.push import require_push
 from rtcd_jax.certificate.check.squares import GramCertificate, Obligation, margin
 from rtcd_jax.certificate.check.taylor import terms_of
 
-FORMAT, VERSION = "rtcd certificate", 1
+FORMAT, VERSION = "rtcd certificate", 2
+VERSIONS = 1, 2
 
 
 class Report(NamedTuple):
@@ -54,6 +57,8 @@ def margins(todo: Mapping[str, Obligation], cases: Mapping[str, GramCertificate]
 def check_interval(claim: Claim, interval: Interval, place: str):
     """The margin of one interval's proof."""
     require_bounds(claim, motion(claim, interval), place)
+    if claim.push != 0:
+        require_push(claim, interval, place)
     return min(margins(funnel_obligations(claim, interval, place), interval.cases, f"{place}.cases").values())
 
 
@@ -70,24 +75,24 @@ def check_chain(claim: Claim, intervals: Sequence[Interval], place: str) -> None
     require(reached[0] + reached[1] == len(claim.u), place, "does not reach the last knot")
 
 
-def check_goal(claim: Claim, node: Node, outlet: list) -> tuple[list, list, int, Any]:
-    """Axes of the goal region, how close motions come [n], the number of shells and the least margin."""
-    axes, order, weight, shells = read_goal(node, claim)
+def check_goal(claim: Claim, node: Node, outlet: list) -> tuple[Goal, list, Any]:
+    """The goal region, how close motions come [n], and the least margin."""
+    goal = read_goal(node, claim)
     for i, bound in enumerate(claim.bounds):
         left = None if bound is None else bound - abs(claim.x_goal[i])
-        inside = left is None or (left > 0 and left * left > dot(axes[i], axes[i]))
-        require(inside, f"{node.place}.axes", f"the limit on |{claim.plant.states[i]}| is not kept")
-    field = goal_field(claim, axes, order, node.place)
-    require_arrival(claim, outlet, axes, weight, f"{node.place}.axes")
+        inside = left is None or (left > 0 and left * left > dot(goal.axes[i], goal.axes[i]))
+        require(inside, f"{node.place}.axes", f"the limit on |{claim.robot.states[i]}| is not kept")
+    field = goal_field(claim, goal.axes, goal.order, node.place)
+    require_arrival(claim, outlet, goal.axes, goal.weight, f"{node.place}.axes")
     least, drift = None, Q(0)
-    for i, shell in enumerate(shells):
+    for i, shell in enumerate(goal.shells):
         todo = goal_obligations(claim, field, shell.start, shell.end)
         smallest = min(margins(todo, shell.cases, f"{node.place}.shells[{i}].cases").values())
         least = smallest if least is None else min(least, smallest)
         drift = max(drift, *(each.drift for each in todo.values()))
-    rest = drift / least
+    rest = max(goal.rest, drift / least)
     require(rest < 1, node.place, "the rounding of the goal is too large for a proof")
-    return axes, [rest * root_up(dot(row, row)) for row in axes], len(shells), least
+    return goal, [rest * root_up(dot(row, row)) for row in goal.axes], least
 
 
 def check(content: Any, progress: Callable[[int, int], None] = lambda done, of: None) -> Report:
@@ -109,21 +114,23 @@ def _check(content: Any, progress: Callable[[int, int], None]) -> Report:
     top = Node("certificate", content)
     top.require(isinstance(content, dict), "must be an object")
     top.require(content.get("format") == FORMAT, f"is no {FORMAT!r}")
-    top.require(type(content.get("version")) is int and content["version"] == VERSION, f"must be of version {VERSION}")
+    version = content.get("version")
+    top.require(type(version) is int and version in VERSIONS, "must be of version 1 or 2")
     _, _, about, funnel, goal, notes = top.keys("format", "version", "claim", "funnel", "goal", "notes")
     texts, claim = read_notes(notes), read_claim(about)
+    top.require(("plant" in about.value) == (version == 1), f"has the claim of another version than {version}")
     intervals = [read_interval(item, claim) for item in funnel.items(at_least=1)]
     check_chain(claim, intervals, funnel.place)
-    l_goal, rest, shells, least = check_goal(claim, goal, intervals[-1].last)
+    region, rest, least = check_goal(claim, goal, intervals[-1].last)
     for i, interval in enumerate(intervals):
         least = min(least, check_interval(claim, interval, f"{funnel.place}[{i}]"))
         progress(i + 1, len(intervals))
     top.require_digests()
-    volumes, axes = volumes_of(claim, intervals, l_goal)
+    volumes, axes = volumes_of(claim, intervals, region.axes)
     begin = rounded((claim.start[0] + claim.start[1]) * claim.dt)
     return Report(
-        claim, digest(about.value), len(intervals), shells, begin, rounded(len(claim.u) * claim.dt), volumes, axes,
-        [rounded(r) for r in rest], rounded(least), texts,
+        claim, digest(about.value), len(intervals), len(region.shells), begin, rounded(len(claim.u) * claim.dt),
+        volumes, axes, [rounded(r) for r in rest], rounded(least), texts,
     )  # fmt: skip
 
 
@@ -160,30 +167,90 @@ def total(values: Sequence[float]) -> float:
         return math.inf
 
 
-def sentence(name: str, report: Report) -> str:
+def sentence(report: Report) -> str:
     """What is proved, in plain words."""
-    claim, plant, v = report.claim, report.claim.plant, report.volumes
-    numbers = ", ".join(f"{key} = {float(value):.6g}" for key, value in claim.parameters.items())
-    unit = " ".join(plant.units)
+    claim, robot, v = report.claim, report.claim.robot, report.volumes
+    unit = " ".join(robot.units)
 
     def extent(place: str) -> str:
-        triples = zip(plant.states, report.axes[place], plant.units, strict=True)
+        triples = zip(robot.states, report.axes[place], robot.units, strict=True)
         return f"{place} " + ", ".join(f"{state} +-{value:.3g} {unit}" for state, value, unit in triples)
 
-    limits = [(s, b, u) for s, b, u in zip(plant.states, claim.bounds, plant.units, strict=True) if b is not None]
+    limits = [(s, b, u) for s, b, u in zip(robot.states, claim.bounds, robot.units, strict=True) if b is not None]
     bounds = " and ".join(f"|{state}| <= {float(bound):.6g} {unit}" for state, bound, unit in limits)
-    return (
-        f"PROVED in continuous time, by exact arithmetic, for the model {name!r} ({numbers}; SI units) under the "
-        f"claimed controller, whose input never exceeds {float(claim.limit):.6g} {plant.input_unit}: every motion that "
-        f"is in the funnel at some time of [{report.start:.6g} s, {report.end:.6g} s] stays in it, is in the goal "
-        f"region at {report.end:.6g} s, never leaves that region, and converges to within "
-        f"{max(report.rest):.1g} of the goal in every state; {bounds or 'there is no limit on a state'} all the while. "
-        f"Half widths: {extent('inlet')}; {extent('outlet')}; {extent('goal')}. Volumes (proved) [{unit}]: inlet "
-        f"{v['inlet']:.6g}, sum over the knots {v['sum']:.6g}, integral over time {v['integral']:.6g} s, goal region "
-        f"{v['goal']:.6g}. {report.intervals} intervals of time and {report.shells} of level, smallest margin "
-        f"{report.margin:.2g}. It is a statement about this model, its state known exactly and its input "
-        f"applied without sampling, not about hardware. Claim: sha256 {report.digest}."
+    least, largest = (f"{float(limit):.6g}" for limit in claim.limits)
+    limit = (
+        f"{largest} {robot.input_unit}" if least == largest else f"a limit in [{least}, {largest}] {robot.input_unit}"
     )
+    comes = (
+        f"comes and stays within {_widths(report)} of the goal"
+        if claim.moves_the_goal
+        else f"converges to within {max(report.rest):.1g} of the goal in every state"
+    )
+    push = (
+        f" A state on the nominal motion that an impulse of up to {float(claim.push):.6g} {robot.input_unit} s on the "
+        f"motor hits, once and at any instant of [{report.start:.6g} s, {report.end:.6g} s], stays in the funnel."
+        if claim.push
+        else ""
+    )
+    return (
+        f"PROVED in continuous time, by exact arithmetic, for {_robots(claim)} under the claimed controller, whose "
+        f"input never exceeds {limit}{_acts(claim)}: every motion that is in the funnel at some time of "
+        f"[{report.start:.6g} s, {report.end:.6g} s] stays in it, is in the goal region at {report.end:.6g} s, never "
+        f"leaves that region, and "
+        f"{comes}; {bounds or 'there is no limit on a state'} all the while.{push} Half widths: {extent('inlet')}; "
+        f"{extent('outlet')}; {extent('goal')}. Volumes (proved) [{unit}]: inlet {v['inlet']:.6g}, sum over the knots "
+        f"{v['sum']:.6g}, integral over time {v['integral']:.6g} s, goal region {v['goal']:.6g}. {report.intervals} "
+        f"intervals of time and {report.shells} of level, smallest margin {report.margin:.2g}. It is a statement about "
+        f"{_reservation(claim)}, not about hardware. Claim: sha256 {report.digest}."
+    )
+
+
+def _robots(claim: Claim) -> str:
+    """The model or models, with their numbers."""
+    texts = []
+    for name, (low, high) in claim.parameters.items():
+        a, b = f"{rounded(low):.6g}", f"{rounded(high):.6g}"
+        texts.append(f"{printable(name)} = {a}" if low == high else f"{printable(name)} in [{a}, {b}]")
+    name, numbers = printable(claim.robot.name), ", ".join(texts)
+    if not claim.uncertain:
+        return f"the model {name!r} ({numbers}; SI units)"
+    return f"every robot {name!r} with {numbers} (SI units; constant or varying in time)"
+
+
+def _acts(claim: Claim) -> str:
+    """What else acts on the loop, each with its bound."""
+    robot, acts = claim.robot, []
+    if claim.disturbance:
+        acts.append(
+            f"every disturbance |w(t)| <= {float(claim.disturbance):.6g} {robot.input_unit} on top of the motor"
+        )
+    errors = [
+        f"{state} +-{float(error):.3g} {unit}"
+        for state, error, unit in zip(robot.states, claim.noise, robot.units, strict=True)
+        if error
+    ]
+    if errors:
+        acts.append(f"every error of the measured state within {', '.join(errors)}")
+    if claim.age:
+        acts.append(
+            f"feedback whose state was measured at most {float(claim.age):.6g} s ago, under the controller in charge "
+            "and not before the motion began"
+        )
+    return "".join(f", for {act}" for act in acts)
+
+
+def _widths(report: Report) -> str:
+    robot = report.claim.robot
+    triples = zip(robot.states, report.rest, robot.units, strict=True)
+    return ", ".join(f"{state} +-{rest:.3g} {unit}" for state, rest, unit in triples)
+
+
+def _reservation(claim: Claim) -> str:
+    known = "known up to these errors" if any(claim.noise) else "known exactly"
+    sampled = "its feed-forward in time" if claim.age else "its input applied without sampling"
+    model = "these models, their" if claim.uncertain else "this model, its"
+    return f"{model} state {known} and {sampled}"
 
 
 def check_file(path: Path, progress: Callable[[int, int], None] = lambda done, of: None) -> Report:

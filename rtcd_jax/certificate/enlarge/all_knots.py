@@ -152,8 +152,8 @@ class Program:
     def within_limits(self) -> Rows:
         """Half widths along the states: the diagonal of P^-1 is at most their squares."""
         clearance = FRACTION_OF_LIMIT * (self.loop.bounds - np.abs(self._nominal()[0]))
-        angle = self.loop.plant.angle
-        clearance[..., angle] = np.minimum(clearance[..., angle], WIDEST)
+        angles = self.loop.hinges
+        clearance[..., angles] = np.minimum(clearance[..., angles], WIDEST)
         bounded = np.flatnonzero(np.isfinite(clearance[0, 0]))
         spread = np.linalg.inv(self.value)
         widths = np.diagonal(spread, axis1=-2, axis2=-1)[..., bounded]

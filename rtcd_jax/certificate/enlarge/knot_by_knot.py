@@ -142,8 +142,8 @@ def importance(g: np.ndarray, attraction: float) -> np.ndarray:
 def _limits(loop: Loop, k: int, fraction: float, axes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Rows and least values: half widths |row of L| grow backward no faster than their clearance allows."""
     clearance = FRACTION_OF_LIMIT * loop.clearance(k, fraction)
-    widths, angle = np.linalg.norm(axes, axis=1), loop.plant.angle
-    clearance[angle] = min(clearance[angle], max(WIDEST, widths[angle]))
+    widths, angles = np.linalg.norm(axes, axis=1), loop.hinges
+    clearance[angles] = np.minimum(clearance[angles], np.maximum(WIDEST, widths[angles]))
     bounded = np.isfinite(clearance)
     widths = widths[bounded]
     rows = (axes[bounded] / widths[:, None]).T

@@ -71,23 +71,24 @@ class Part(NamedTuple):
         )  # fmt: skip
 
 
-def falsify_file(path: Path, rollouts: int, seed: int, workers: int, console: Console) -> bool:
+def falsify_file(path: Path, rollouts: int, seed: int, workers: int, console: Console, beyond: float = 1.0) -> bool:
     """Simulates `rollouts` motions of a certificate; True if none broke it. The workers' number changes nothing.
 
+    What the certificate leaves uncertain is drawn, its half widths `beyond` times as large; beyond 1 nothing is proved.
     A journal beside the certificate keeps finished parts: after a kill the same command goes on.
 
     Raises:
         UserError: no certificate, one that cannot be simulated, or a folder that cannot be written.
     """
-    motions = Motions.of(path)
+    motions = Motions.of(path, beyond)
     digest = hashlib.sha256(path.read_bytes()).hexdigest()
-    head = {"certificate": digest, "rollouts": rollouts, "seed": seed, "chunk": CHUNK}
+    head = {"certificate": digest, "rollouts": rollouts, "seed": seed, "chunk": CHUNK, "beyond": beyond}
     journal = Journal(path.with_name(f".{path.stem}.falsify.jsonl"), head)
     steps = enough_steps(motions, seed)
     finished = len(journal.lines)
     parts = [Part(**line) for line in journal.lines]
     clock = Clock(before=sum(part.rollouts for part in parts))
-    for part in _parts(path, rollouts, seed, steps, workers, finished):
+    for part in _parts((path, beyond), rollouts, seed, steps, workers, finished):
         journal.append(part._asdict())
         parts.append(part)
         done, level = sum(each.rollouts for each in parts), max(each.level for each in parts)
@@ -124,12 +125,14 @@ def enough_steps(motions: Motions, seed: int) -> int:
     return steps
 
 
-def _parts(path: Path, rollouts: int, seed: int, steps: int, workers: int, finished: int) -> Iterator[Part]:
+def _parts(
+    what: tuple[Path, float], rollouts: int, seed: int, steps: int, workers: int, finished: int
+) -> Iterator[Part]:
     """The parts in their order, from the first unfinished one."""
     sizes = [min(CHUNK, rollouts - start) for start in range(0, rollouts, CHUNK)][finished:]
     if not sizes:
         return
-    with processes(min(workers, len(sizes)), _remember, path) as pool:
+    with processes(min(workers, len(sizes)), _remember, what) as pool:
         seeds = [(seed, finished + i) for i in range(len(sizes))]
         yield from pool.map(_work, sizes, seeds, [steps] * len(sizes))
 
@@ -137,10 +140,10 @@ def _parts(path: Path, rollouts: int, seed: int, steps: int, workers: int, finis
 _motions: Motions
 
 
-def _remember(path: Path) -> None:
-    """In a worker: the certificate."""
+def _remember(what: tuple[Path, float]) -> None:
+    """In a worker: the certificate, and how much more is uncertain."""
     global _motions
-    _motions = Motions.of(path)
+    _motions = Motions.of(*what)
 
 
 def _work(count: int, seed: tuple[int, int], steps: int) -> Part:
@@ -172,9 +175,10 @@ def summed(parts: list[Part], steps: int) -> Summary:
 def sentence(motions: Motions, summary: Summary) -> str:
     """The summary in plain words."""
     nearest = f"closest {summary.share_of_limit:.6f} of it" if summary.share_of_limit else "there is none"
+    times = f", all that is uncertain {motions.beyond:g} times as large as certified" if motions.beyond != 1 else ""
     return (
         f"{summary.rollouts} simulated motions of the {motions.plant} from instants all over [{motions.start:.6g} s, "
-        f"{motions.end:.6g} s], half of them from the funnel's boundary: {summary.left_funnel} left the funnel "
+        f"{motions.end:.6g} s], half of them from the funnel's boundary{times}: {summary.left_funnel} left the funnel "
         f"(largest |y| after the start {summary.level:.9f}), {summary.left_limits} exceeded a limit on the states "
         f"({nearest}), {summary.moved_away} moved away from the goal in the goal region, "
         f"{summary.not_arrived} did not arrive. Integrator: {summary.steps} classical Runge-Kutta steps an interval; "

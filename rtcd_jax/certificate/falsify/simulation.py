@@ -1,9 +1,11 @@
-"""Simulated motions of a certificate's closed loop, from its claim and its ellipsoids alone.
+"""Simulated motions of a certificate's closed loops, from its claim and its ellipsoids alone.
 
-The equations are those of `rtcd_jax.analysis.verify`, written apart from the checker's and the plants'. Every motion is
-integrated by classical Runge-Kutta steps; every `REPEATED`-th one a second time with halved steps, and the largest
-difference of the two in |y| is the measure of the integrator's error. The loop is Lipschitz, with kinks where the
-input meets its limit, so the order is two at least and that difference is 3/4 of the error or more.
+Every motion has its own robot of the claim's box, its own motor, and signs of the disturbance and of the feedback's
+errors that change at every step: half of the motions take those by which |y| grows fastest, the others random ones. A
+measurement acts as long as the claim allows. The equations (`robots.py`) are written apart from the checker's. Every
+motion is integrated by classical Runge-Kutta steps; every `REPEATED`-th one a second time with halved steps, and the
+largest difference of the two in |y| is the measure of the integrator's error. The loop is Lipschitz, with kinks where
+the input meets its limit, so the order is two at least and that difference is 3/4 of the error or more.
 """
 
 import itertools
@@ -17,8 +19,7 @@ from numpy.linalg import LinAlgError
 
 from rtcd_jax.certificate import check
 from rtcd_jax.certificate.check import Node, Refused, Undecided
-from rtcd_jax.config.plants import stored_plant
-from rtcd_jax.plants import dynamics_of
+from rtcd_jax.certificate.falsify.robots import Drawn, draw, rate
 from rtcd_jax.system.errors import UserError
 
 REPEATED = 16
@@ -37,8 +38,8 @@ TOGETHER = 0.2
 SETTLING = LONGEST / 1e5, TOGETHER / 2
 """Lengths [s] of a step in the goal region, however long a knots' interval is."""
 
-Input = Callable[[float, np.ndarray], np.ndarray]
-"""Time [s], states [n M] -> u [M]."""
+Feedback = Callable[[float, np.ndarray], np.ndarray]
+"""Time [s], states [n M] -> K (x - x*) [M]."""
 
 
 class Ellipsoids(NamedTuple):
@@ -57,6 +58,30 @@ class Ellipsoids(NamedTuple):
         return (self.first * (1 - s) + self.last * (1 + s)) / 2 + (1 - s * s) * (self.bend[0] + s * self.bend[1])
 
 
+class Law(NamedTuple):
+    """The controller on an interval or at the goal: u = feedforward - feedback, before it is clipped.
+
+    `errors` bounds what the errors of the measured state do to the feedback.
+    """
+
+    feedforward: float
+    feedback: Feedback
+    errors: float
+
+
+class Acting(NamedTuple):
+    """What acts in one step on some motions: their robots, the signs [M] of w and of the errors, and the feedback [M]
+    of a former measurement that acts still, or None.
+    """
+
+    drawn: Drawn
+    signs: np.ndarray
+    held: np.ndarray | None
+
+    def part(self, who: Any) -> "Acting":
+        return Acting(self.drawn.part(who), self.signs[who], None if self.held is None else self.held[who])
+
+
 class MotionResults(NamedTuple):
     """Of every motion, after its start: the largest |y| in the funnel, the largest share of a limit, the largest
     growth of |y| in one step in the goal region, whether it arrived; of all, the integrator's error in |y|."""
@@ -70,9 +95,9 @@ class MotionResults(NamedTuple):
 
 @final
 class Motions:
-    """What a certificate's file claims, in floats."""
+    """What a certificate's file claims, in floats; robots and what acts on them may be `beyond` times as uncertain."""
 
-    def __init__(self, content: Any):
+    def __init__(self, content: Any, beyond: float = 1.0):
         claim = check.read_claim(Node("claim", content["claim"]))
         low, high = STEPS
         check.require(
@@ -80,10 +105,10 @@ class Motions:
         )
         intervals = [check.read_interval(Node(f"funnel[{i}]", each), claim) for i, each in enumerate(content["funnel"])]
         check.require(len(intervals) > 0, "funnel", "has no intervals")
-        name = content["claim"]["plant"]
-        self.plant, self.n, self.dt, self.limit = name, claim.n, float(claim.dt), float(claim.limit)
-        parameters = {key: float(value) for key, value in claim.parameters.items()}
-        self._rate = dynamics_of(stored_plant(name), parameters, 0)
+        self.claim, self.beyond = claim, beyond
+        self.plant, self.n, self.dt = claim.robot.name, claim.n, float(claim.dt)
+        self._noise, self._age = _floats(claim.noise), beyond * float(claim.age)
+        self.rest = float(check.read_goal(Node("goal", content["goal"]), claim).rest)
         self._x, self._rates, self._u, self._gains = map(_floats, (claim.x, claim.rates, claim.u, claim.K))
         self._goal, self._goal_gain = _floats(claim.x_goal), _floats(claim.K_goal)
         self._bounds = np.array([np.inf if b is None else float(b) for b in claim.bounds])
@@ -97,14 +122,14 @@ class Motions:
 
     @classmethod
     @np.errstate(all="ignore")
-    def of(cls, path: Path) -> "Motions":
+    def of(cls, path: Path, beyond: float = 1.0) -> "Motions":
         """Of a certificate's file.
 
         Raises:
             UserError: the file cannot be read, or is no certificate.
         """
         try:
-            return cls(check.parse(check.read_bytes(path)))
+            return cls(check.parse(check.read_bytes(path)), beyond)
         except OSError as error:
             raise UserError(f"{path}: {error.strerror}") from None
         except (Refused, Undecided, KeyError, TypeError, RecursionError, OverflowError, LinAlgError) as error:
@@ -120,7 +145,8 @@ class Motions:
         lengths = np.cumsum([p.end - p.start for p in self.intervals])
         places = np.searchsorted(lengths / lengths[-1], (np.arange(count) + 0.5) / count)
         y, x = _ball(self.n, count, random), np.empty((self.n, count))
-        flight = _Flight(self._bounds, x, x[:, ::REPEATED].copy())
+        drawn = draw(self.claim, count, self.beyond, random)
+        flight = _Flight(self._bounds, x, x[:, ::REPEATED].copy(), drawn, random)
         for place, interval in enumerate(self.intervals):
             before, after = np.searchsorted(places, (place, place + 1))
             fraction = random.uniform(interval.start, interval.end)
@@ -140,11 +166,20 @@ class Motions:
         again = slice(-(-who.start // REPEATED), -(-who.stop // REPEATED))
         fractions = np.linspace(start, interval.end, steps + 1)
         step = (fractions[1] - fractions[0]) * self.dt
-        law = self.tracking(interval.knot)
-        for fraction, ahead in itertools.pairwise(fractions):
-            t = fraction * self.dt
-            flight.x[:, who] = self.advanced(law, t, step, flight.x[:, who], 1)
-            flight.again[:, again] = self.advanced(law, t, step, flight.again[:, again], 2)
+        law, drawn = self.tracking(interval.knot), flight.drawn.part(who)
+        twice = slice(-who.start % REPEATED, None, REPEATED)  # of these motions, those that are run again
+        held = held_again = None
+        for i, (fraction, ahead) in enumerate(itertools.pairwise(fractions)):
+            t, x = fraction * self.dt, flight.x[:, who]
+            if (steps_held := int(self._age / step)) and i % steps_held == 0:
+                held, held_again = (law.feedback(t, each) for each in (x, flight.again[:, again]))
+            inward = np.linalg.inv(interval.axes(fraction))
+            acting = Acting(
+                drawn, self._signs(law, t, x, inward, self.nominal(interval.knot, fraction), drawn, flight), held
+            )
+            flight.x[:, who] = self.advanced(law, t, step, x, 1, acting)
+            acting = acting.part(twice)._replace(held=held_again)
+            flight.again[:, again] = self.advanced(law, t, step, flight.again[:, again], 2, acting)
             inward = np.linalg.inv(interval.axes(ahead))
             flight.measure(self.nominal(interval.knot, ahead), inward, who, again)
 
@@ -152,18 +187,23 @@ class Motions:
         """Whether every motion arrives, and the largest growth of |y| in one step."""
         count, step = flight.x.shape[1], float(np.clip(COARSER * self.dt / steps, *SETTLING))
         arrived, growth = np.zeros(count, bool), np.zeros(count)
-        moving = np.arange(count)
+        moving, near, law = np.arange(count), max(ARRIVED, self.rest), self._holding
         for _ in range(round(LONGEST / TOGETHER)):
             x, level = flight.x[:, moving], self.goal_level(flight.x[:, moving])
+            drawn, held = flight.drawn.part(moving), None
             for i in range(round(TOGETHER / step)):
-                x = self.advanced(self._holding, i * step, step, x, 1)
+                if (steps_held := int(self._age / step)) and i % steps_held == 0:
+                    held = law.feedback(0.0, x)
+                signs = self._signs(law, 0.0, x, self._outward, self._goal, drawn, flight)
+                x = self.advanced(law, i * step, step, x, 1, Acting(drawn, signs, held))
                 now = self.goal_level(x)
-                growth[moving] = np.maximum(growth[moving], now - level)
+                grown = np.where(level > near, now - level, 0) if self.rest else now - level
+                growth[moving] = np.maximum(growth[moving], grown)
                 level = now
                 flight.measure_limits(x, moving)
             flight.x[:, moving] = x
-            arrived[moving[level <= ARRIVED]] = True
-            moving = moving[(level > ARRIVED) & (level < LOST)]
+            arrived[moving[level <= near]] = True
+            moving = moving[(level > near) & (level < LOST)]
             if not moving.size:
                 break
         return arrived, growth
@@ -177,32 +217,51 @@ class Motions:
         a, b, va, vb = self._x[k], self._x[k + 1], self._rates[k][0] * self.dt, self._rates[k][1] * self.dt
         return a + t * (va + t * (3 * (b - a) - 2 * va - vb + t * (2 * (a - b) + va + vb)))
 
-    def tracking(self, k: int) -> Input:
-        """The controller's law on interval k, before it is clipped."""
+    def tracking(self, k: int) -> Law:
+        """The controller's law on interval k."""
 
-        def u(t: float, x: np.ndarray) -> np.ndarray:
+        def feedback(t: float, x: np.ndarray) -> np.ndarray:
             fraction = t / self.dt
             gain = self._gains[k] + fraction * (self._gains[k + 1] - self._gains[k])
-            return self._u[k] - gain @ (x - self.nominal(k, fraction)[:, None])
+            return gain @ (x - self.nominal(k, fraction)[:, None])
 
-        return u
+        largest = np.maximum(np.abs(self._gains[k]), np.abs(self._gains[k + 1]))
+        return Law(float(self._u[k]), feedback, float(largest @ self._noise))
 
-    def _holding(self, _: float, x: np.ndarray) -> np.ndarray:
-        return -self._goal_gain @ (x - self._goal[:, None])
+    @property
+    def _holding(self) -> Law:
+        def feedback(_: float, x: np.ndarray) -> np.ndarray:
+            return self._goal_gain @ (x - self._goal[:, None])
 
-    def _slope(self, law: Input, t: float, x: np.ndarray) -> np.ndarray:
-        u = np.clip(law(t, x), -self.limit, self.limit)
-        return np.ascontiguousarray(self._rate(x.T, u[:, None]).T)
+        return Law(0.0, feedback, float(np.abs(self._goal_gain) @ self._noise))
 
-    def advanced(self, law: Input, t: float, step: float, x: np.ndarray, parts: int) -> np.ndarray:
+    def _signs(self, law: Law, t: float, x, inward, center, drawn: Drawn, flight: "_Flight") -> np.ndarray:
+        """Of w and of the errors: those by which |y| grows fastest, or random ones; 1 where nothing acts."""
+        if not (law.errors or self.claim.disturbance):
+            return np.ones(x.shape[1])
+        u = np.zeros(x.shape[1])
+        pushed = rate(self.claim.robot, drawn, x, u + 1) - rate(self.claim.robot, drawn, x, u)
+        greedy = np.sum((inward @ (x - center[:, None])) * (inward @ pushed), axis=0)
+        return np.where(
+            drawn.greedy > 0, np.where(greedy >= 0, 1.0, -1.0), flight.random.choice([-1.0, 1.0], x.shape[1])
+        )
+
+    def _slope(self, law: Law, t: float, x: np.ndarray, acting: Acting) -> np.ndarray:
+        drawn, signs = acting.drawn, acting.signs
+        feedback = law.feedback(t, x) if acting.held is None else acting.held
+        asked = law.feedforward - feedback + signs * drawn.errors * law.errors
+        u = np.clip(asked, -drawn.limit, drawn.limit) + signs * drawn.disturbance
+        return rate(self.claim.robot, drawn, x, u)
+
+    def advanced(self, law: Law, t: float, step: float, x: np.ndarray, parts: int, acting: Acting) -> np.ndarray:
         """The states after one step, taken in `parts` classical Runge-Kutta steps."""
         h = step / parts
         for part in range(parts):
             now = t + part * h
-            a = self._slope(law, now, x)
-            b = self._slope(law, now + h / 2, x + h / 2 * a)
-            c = self._slope(law, now + h / 2, x + h / 2 * b)
-            d = self._slope(law, now + h, x + h * c)
+            a = self._slope(law, now, x, acting)
+            b = self._slope(law, now + h / 2, x + h / 2 * a, acting)
+            c = self._slope(law, now + h / 2, x + h / 2 * b, acting)
+            d = self._slope(law, now + h, x + h * c, acting)
             x = x + h / 6 * (a + 2 * (b + c) + d)
         return x
 
@@ -210,8 +269,9 @@ class Motions:
 class _Flight:
     """Motions under way: their states [n M], every `REPEATED`-th by halved steps, and their results so far."""
 
-    def __init__(self, bounds: np.ndarray, x: np.ndarray, again: np.ndarray):
+    def __init__(self, bounds: np.ndarray, x: np.ndarray, again: np.ndarray, drawn: Drawn, random: np.random.Generator):
         self.x, self.again, self.error = x, again, 0.0
+        self.drawn, self.random = drawn, random
         self.level, self.share_of_limit = np.zeros(x.shape[1]), np.zeros(x.shape[1])
         self._limited = np.isfinite(bounds)
         self._bounds = bounds[self._limited, None]

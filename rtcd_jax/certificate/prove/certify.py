@@ -17,6 +17,8 @@ from rtcd_jax.certificate.prove.backward import DECAY_MARGINS, BackwardProof, Pr
 from rtcd_jax.certificate.prove.closed_loop import Loop, claim_of, double, doubles, with_digests
 from rtcd_jax.certificate.prove.goal import GoalRegion, goal_region
 from rtcd_jax.certificate.prove.levels import leveled, unit_directions
+from rtcd_jax.certificate.prove.margins import feedback_speed, push_margin
+from rtcd_jax.certificate.prove.uncertainty import bounds_of, uncertainty_of
 from rtcd_jax.certificate.standing import accepted, remember
 from rtcd_jax.elite.elite import Elite
 from rtcd_jax.system.files import replace
@@ -59,20 +61,28 @@ class Outcome(NamedTuple):
 
 
 def certify_elite(
-    run: Path, name: str, rung: str, on_step: Callable[[Step], None], optimize_value: bool = False
+    run: Path,
+    name: str,
+    rung: str,
+    on_step: Callable[[Step], None],
+    optimize_value: bool = False,
+    uncertainty: Path | None = None,
 ) -> Outcome | None:
     """Writes `certificates/NAME.json` of a run folder; None if not even a goal region can be shown.
 
-    `optimize_value` chooses the ellipsoids' shapes so that the funnel is large.
+    `optimize_value` chooses the ellipsoids' shapes so that the funnel is large. The certificate bears what the run
+    bore, or the `uncertainty` of a file.
 
     Raises:
         UserError: an elite that is not there, or of a plant that the checker does not know.
     """
     began = time.perf_counter()
     elite = Elite.read(run, name)
-    loop_record, folder = claim_of(elite), run / "certificates"
-    at_goal = with_digests({**loop_record, "start": [len(elite.u) - 1, double(1.0)]})
-    claim = check.read_claim(Node("claim", at_goal))
+    bounds, folder = bounds_of(elite, uncertainty_of(elite, uncertainty)), run / "certificates"
+    loop_record = claim_of(elite, bounds)
+    if bounds.age:
+        loop_record["speed"] = double(feedback_speed(_read(loop_record, elite), elite))
+    claim = _read(loop_record, elite)
     loop, exact = Loop(claim, elite), rung == "proved"
     journal = Journal(
         folder / f".{name}.partial.jsonl",
@@ -80,7 +90,7 @@ def certify_elite(
     )
     if optimize_value:
         loop = _shaped(loop, journal)
-    region = _region(claim, loop, exact, journal)
+    region = _region(claim, loop, exact, bounds.rest, journal)
     if region is None:
         return None
     goal, outlet = region
@@ -103,10 +113,11 @@ def certify_elite(
     if not intervals:
         return None
     start = [intervals[0]["knot"], intervals[0]["start"]]
+    push = push_margin(claim, [check.read_interval(Node("funnel", each), claim) for each in intervals])
     content = {
         "format": check.FORMAT,
         "version": check.VERSION,
-        "claim": with_digests({**loop_record, "start": start}),
+        "claim": with_digests({**loop_record, "start": start, "push": double(push)}),
         "funnel": intervals,
         "goal": goal,
         "notes": {"elite": name, "rung at writing": rung},
@@ -138,12 +149,20 @@ def _finish(path: Path, content: dict[str, Any], elite: Elite, rung: str, second
     return Outcome(path.stem, rung, start * step, len(intervals), seconds, sampled, volumes)
 
 
-def _region(claim: Claim, loop: Loop, exact: bool, journal: Journal) -> tuple[dict[str, Any], float] | None:
+def _read(loop_record: Mapping[str, Any], elite: Elite) -> Claim:
+    """The claim, with nothing proved yet."""
+    nothing = {"start": [len(elite.u) - 1, double(1.0)], "push": double(0.0)}
+    return check.read_claim(Node("claim", with_digests({**loop_record, **nothing})))
+
+
+def _region(
+    claim: Claim, loop: Loop, exact: bool, rest: float, journal: Journal
+) -> tuple[dict[str, Any], float] | None:
     """The goal's record and the outlet's level, from the journal if it has them."""
     for line in journal.lines:
         if "goal" in line:
             return line["goal"], line["outlet"]
-    region = goal_region(claim, loop, exact)
+    region = goal_region(claim, loop, exact, rest)
     if region is None:
         return None
     goal = _goal_record(region)
@@ -207,8 +226,8 @@ def _goal_record(region: GoalRegion) -> dict[str, Any]:
         with_digests({"start": double(s.start), "end": double(s.end), "cases": _cases_record(s.cases)})
         for s in region.shells
     ]
-    record = {"axes": _matrix(region.axes), "order": region.order, "weight": double(weight), "shells": shells}
-    return with_digests(record)
+    record = {"axes": _matrix(region.axes), "order": region.order, "weight": double(weight)}
+    return with_digests({**record, "rest": double(region.rest), "shells": shells})
 
 
 def _cases_record(cases: Mapping[str, GramCertificate]) -> dict[str, Any]:

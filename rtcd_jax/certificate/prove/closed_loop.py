@@ -2,11 +2,15 @@
 
 from collections.abc import Callable, Mapping
 from copy import copy
-from typing import Any, final
+from functools import lru_cache
+from math import comb
+from typing import Any, NamedTuple, final
 
 import numpy as np
 
 from rtcd_jax.certificate import check
+from rtcd_jax.certificate.prove.uncertainty import Bounds, bounds_of
+from rtcd_jax.config.schema import UncertaintyConfig
 from rtcd_jax.elite.elite import Elite
 from rtcd_jax.elite.funnel import value_rates
 from rtcd_jax.numerics.hermite import cubic_hermite, cubic_hermite_rate
@@ -32,36 +36,81 @@ def with_digests(record: Mapping[str, Any]) -> dict[str, Any]:
     return {**record, "sha256": {name: check.digest(value) for name, value in record.items()}}
 
 
-def claim_of(elite: Elite) -> dict[str, Any]:
-    """The claim about an elite, without `start`: what is to be proved is fixed before the proof.
+def claim_of(elite: Elite, bounds: Bounds | None = None) -> dict[str, Any]:
+    """The claim about an elite, without `start` and `push`: what is to be proved is fixed before the proof.
 
-    The rates of the cubic Hermite interpolant are f(x_k, u_k) and f(x_{k+1}, u_k), rounded to doubles.
+    `bounds`: of what is uncertain; None: nothing is. `speed` is 0, to be set where measurements may be old. The rates
+    of the cubic Hermite interpolant are f(x_k, u_k) and f(x_{k+1}, u_k), rounded to doubles.
 
     Raises:
         UserError: a plant that the checker does not know, more than one input, knots that are not evenly spaced, or a
             number that no claim can hold.
     """
+    plant, numbers = _plant_of(elite)
+    bounds = bounds or bounds_of(elite, UncertaintyConfig())
+    claim = {
+        "robot": robot_record(plant.robot),
+        "parameters": {name: doubles(bounds.parameters[name]) for name in numbers},
+        "limit": doubles(bounds.limit),
+        "disturbance": double(bounds.disturbance),
+        "noise": doubles(bounds.noise),
+        "age": double(bounds.age),
+        "speed": double(0.0),
+        **_loop_record(elite, plant.robot, numbers),
+    }
+    return _readable(claim, {"start": [0, double(0.0)], "push": double(0.0)})
+
+
+def claim_of_version_1(elite: Elite) -> dict[str, Any]:
+    """What a file of version 1 claims about an elite, without `start`. Raises UserError as `claim_of`."""
+    plant, numbers = _plant_of(elite)
+    parameters = {key: double(elite.parameters[key]) for key in plant.parameters}
+    claim = {"plant": elite.plant, "parameters": parameters, **_loop_record(elite, plant.robot, numbers)}
+    return _readable(claim, {"start": [0, double(0.0)]})
+
+
+def _readable(claim: dict[str, Any], rest: dict[str, Any]) -> dict[str, Any]:
+    """The same claim. Raises UserError where the checker's reader refuses it."""
+    try:
+        check.read_claim(check.Node("the elite's claim", with_digests({**claim, **rest})))
+    except check.Refused as refused:
+        raise UserError(str(refused)) from None
+    return claim
+
+
+def _plant_of(elite: Elite) -> tuple[check.Plant, dict[str, np.float64]]:
+    """The robot and its numbers but the limit."""
     name = elite.plant
     if name not in check.PLANTS:
         raise UserError(f"no certificate for the plant {name!r}: the checker knows {', '.join(check.PLANTS)}")
-    plant, x, u = check.PLANTS[name], elite.x, elite.u
-    if u.shape[1] != 1:
-        raise UserError(f"no certificate for {u.shape[1]} inputs: the checker knows loops with one")
+    plant = check.PLANTS[name]
+    if elite.u.shape[1] != 1:
+        raise UserError(f"no certificate for {elite.u.shape[1]} inputs: the checker knows loops with one")
     missing = [key for key in plant.parameters if key not in elite.parameters]
     if missing:
         raise UserError(f"no certificate without the {name}'s {', '.join(missing)}: its parameters lack them")
+    for key in plant.parameters:
+        value = elite.parameters[key]
+        if not (value > 0 or (key in plant.at_least_zero and value == 0)):
+            least = ">= 0" if key in plant.at_least_zero else "> 0"
+            raise UserError(f"the elite's parameters.{key}: = {value:g}: must be {least}")
     parameters = {key: np.float64(elite.parameters[key]) for key in plant.parameters}
-    if float(elite.u_max[0]) != parameters[plant.limit]:
-        raise UserError(f"u_max = {elite.u_max[0]}: must be {plant.limit} = {parameters[plant.limit]}")
+    limit = parameters.pop(plant.limit)
+    if float(elite.u_max[0]) != limit:
+        raise UserError(f"u_max = {elite.u_max[0]}: must be {plant.limit} = {limit}")
+    return plant, parameters
+
+
+def _loop_record(elite: Elite, robot: check.Robot, numbers: Mapping[str, Any]) -> dict[str, Any]:
+    """What claims of both versions say of the closed loop."""
+    x, u = elite.x, elite.u
     dt = elite.time[1] - elite.time[0]
     if not np.allclose(np.diff(elite.time), dt, rtol=1e-9, atol=0):
         raise UserError("no certificate for knots that are not evenly spaced")
     ends = np.stack([x[:-1], x[1:]])
     with np.errstate(all="ignore"):  # the checker's reader refuses what is not finite
-        rates = np.moveaxis(rate(plant, parameters, np.moveaxis(ends, 2, 0), u[:, 0]), 0, 2)
-    claim = {
-        "plant": name,
-        "parameters": {key: double(value) for key, value in parameters.items()},
+        rates = np.moveaxis(rate(robot, numbers, np.moveaxis(ends, 2, 0), u[:, 0]), 0, 2)
+    return {
         "state_limits": [double(limit) if np.isfinite(limit) else None for limit in elite.state_limits],
         "dt": double(dt),
         "x": doubles(x),
@@ -71,27 +120,117 @@ def claim_of(elite: Elite) -> dict[str, Any]:
         "x_goal": doubles(elite.x_goal),
         "K_goal": doubles(elite.K_goal[0]),
     }
-    try:
-        check.read_claim(check.Node("the elite's claim", with_digests({**claim, "start": [0, double(0.0)]})))
-    except check.Refused as refused:
-        raise UserError(str(refused)) from None
-    return claim
 
 
-def rate(plant: check.Plant, parameters: Mapping[str, float], x: np.ndarray, u: Any) -> np.ndarray:
+def robot_record(robot: check.Robot) -> dict[str, Any]:
+    """A robot as certificates write it."""
+
+    def function(terms: Any) -> list[dict[str, Any]]:
+        return [
+            {
+                "joints": list(each.joints),
+                "powers": dict(each.powers),
+                "cos": double(each.cosine),
+                "sin": double(each.sine),
+            }
+            for each in terms
+        ]
+
+    functions = {
+        "mass": [[function(entry) for entry in row] for row in robot.mass],
+        "potential": function(robot.potential),
+        "damping": [function(each) for each in robot.damping],
+        "motor": [function(each) for each in robot.motor],
+    }
+    names = {"name": robot.name, "states": list(robot.states), "units": list(robot.units)}
+    return with_digests({**names, "input_unit": robot.input_unit, "joints": list(robot.joints), **functions})
+
+
+@lru_cache
+def float_equations(robot: check.Robot) -> check.Equations:
+    """A robot's equations with float coefficients."""
+
+    def function(terms: Any) -> Any:
+        return tuple(term._replace(cosine=float(term.cosine), sine=float(term.sine)) for term in terms)
+
+    exact = check.derive(robot)
+    return exact._replace(
+        robot=robot._replace(
+            mass=tuple(tuple(function(entry) for entry in row) for row in robot.mass),
+            damping=tuple(map(function, robot.damping)),
+            motor=tuple(map(function, robot.motor)),
+        ),
+        slopes=tuple(map(function, exact.slopes)),
+        christoffel=tuple({pair: function(terms) for pair, terms in row.items()} for row in exact.christoffel),
+    )
+
+
+def field(robot: check.Robot, numbers: Mapping[str, Any], x: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """D [...], a [n ...] and b [n ...] at states x [n ...], real or complex; numbers may be arrays."""
+    equations = float_equations(robot)
+    angles = {k: sum(a * q for a, q in zip(k, x, strict=False) if a) for k in equations.waves}
+    waves = {k: (np.sin(angle), np.cos(angle)) for k, angle in angles.items()}
+    determinant, a, b = equations.field(numbers, x, waves)
+    shape = np.broadcast_shapes(*map(np.shape, (determinant, *a, *b)))
+    whole = [np.broadcast_to(each, shape) for each in (determinant, *a, *b)]
+    return whole[0], np.stack(whole[1 : len(x) + 1]), np.stack(whole[len(x) + 1 :])
+
+
+def rate(robot: check.Robot, numbers: Mapping[str, Any], x: np.ndarray, u: Any) -> np.ndarray:
     """x' [n ...] of states [n ...], real or complex."""
-    angle = x[plant.angle]
-    determinant, drift, push = plant.field(parameters, x, np.sin(angle), np.cos(angle))
-    return np.stack([(a + b * u) / determinant for a, b in zip(drift, push, strict=True)])
+    determinant, drift, push = field(robot, numbers, x)
+    return (drift + push * u) / determinant
 
 
-def linear(
-    plant: check.Plant, parameters: Mapping[str, float], x: np.ndarray, u: float
-) -> tuple[np.ndarray, np.ndarray]:
+def linear(robot: check.Robot, numbers: Mapping[str, Any], x: np.ndarray, u: float) -> tuple[np.ndarray, np.ndarray]:
     """A [n n] and B [n] at x [n], by complex steps."""
     step = 1e-30
-    a = np.imag(rate(plant, parameters, x[:, None] + 1j * step * np.eye(len(x)), u)) / step
-    return a, np.imag(rate(plant, parameters, x.astype(complex), u + 1j * step)) / step
+    a = np.imag(rate(robot, numbers, x[:, None] + 1j * step * np.eye(len(x)), u)) / step
+    return a, np.imag(rate(robot, numbers, x.astype(complex), u + 1j * step)) / step
+
+
+class ControlPoints(NamedTuple):
+    """The field's Bernstein control points over the robots: mixtures [J, nodes] of its values at robots of the box.
+
+    `numbers` are these robots' [nodes 1].
+    """
+
+    numbers: dict[str, np.ndarray]
+    mixtures: np.ndarray
+
+    @classmethod
+    def of(cls, claim: check.Claim) -> "ControlPoints":
+        """With the degrees of the exact field at some state."""
+        space, n = claim.space(0, 0), claim.n
+        states = [check.Q(2 * i + 3, 7) for i in range(n)]
+        waves = {k: (check.Q(3, 5 + i), check.Q(4, 7 + i)) for i, k in enumerate(claim.equations.waves)}
+        determinant, a, b = claim.equations.field(claim.numbers(space), states, waves)
+        exponents = [e for each in (determinant, *a, *b) for e, _ in check.terms_of(space.enclose(each).p)]
+        degrees = [max(e[n + 1 + i] for e in exponents) for i in range(space.m)]
+        axes = {name: np.array([float(low)]) for name, (low, _) in claim.parameters.items()}
+        mixtures = np.eye(1)
+        for name, degree in zip(claim.uncertain, degrees, strict=True):
+            low, high = map(float, claim.parameters[name])
+            at = np.linspace(0, 1, degree + 1)
+            axes[name] = low + (high - low) * at
+            values = np.array(
+                [[comb(degree, j) * t**j * (1 - t) ** (degree - j) for j in range(degree + 1)] for t in at]
+            )
+            mixtures = np.kron(mixtures, np.linalg.inv(values))
+        grid = np.meshgrid(*(axes[name] for name in claim.uncertain), indexing="ij")
+        spread = {name: each.reshape(-1, 1) for name, each in zip(claim.uncertain, grid, strict=True)}
+        return cls({name: spread.get(name, value[:, None]) for name, value in axes.items()}, mixtures)
+
+    def field(self, robot: check.Robot, x: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """D [J D], a [n J D] and b [n J D] at states x [n D]."""
+        return tuple(  # pyright: ignore[reportReturnType]
+            np.einsum(
+                "jk,...kd->...jd",
+                self.mixtures,
+                np.broadcast_to(each, (*each.shape[:-2], len(self.mixtures), x.shape[1])),
+            )
+            for each in field(robot, self.numbers, x[:, None])
+        )
 
 
 @final
@@ -104,9 +243,13 @@ class Loop:
 
     def __init__(self, claim: check.Claim, elite: Elite):
         self.claim = claim
-        self.plant, self.n = claim.plant, claim.n
-        self.parameters = {key: float(value) for key, value in claim.parameters.items()}
-        self.limit, self.dt = float(claim.limit), float(claim.dt)
+        self.robot, self.n, self.hinges = claim.robot, claim.n, list(claim.robot.hinges)
+        self.parameters = {name: float(low + high) / 2 for name, (low, high) in claim.parameters.items()}
+        self.limits, self.disturbance = floats(claim.limits), float(claim.disturbance)
+        self.limit, self.dt = float(self.limits.mean()), float(claim.dt)
+        self.late = [float(check.input_error(claim, k)) for k in range(len(claim.u))]
+        self.late_at_goal = float(check.error_under(claim, [claim.K_goal]))
+        self._points = ControlPoints.of(claim)
         self.x, self.rates, self.u = floats(claim.x), floats(claim.rates), floats(claim.u)
         self.gains, self.goal, self.goal_gain = floats(claim.K), floats(claim.x_goal), floats(claim.K_goal)
         self.bounds = np.array([np.inf if b is None else float(b) for b in claim.bounds])
@@ -114,11 +257,11 @@ class Loop:
         a, b = np.zeros((len(self.u), 2, self.n, self.n)), np.zeros((len(self.u), 2, self.n, 1))
         for k, u in enumerate(self.u):
             for end in (0, 1):
-                a[k, end], b[k, end, :, 0] = linear(self.plant, self.parameters, self.x[k + end], u)
+                a[k, end], b[k, end, :, 0] = linear(self.robot, self.parameters, self.x[k + end], u)
         self.slopes = value_rates(elite, a, b)
 
     def rate(self, x: np.ndarray, u: Any) -> np.ndarray:
-        return rate(self.plant, self.parameters, x, u)
+        return rate(self.robot, self.parameters, x, u)
 
     def shaped(self, values: np.ndarray, slopes: np.ndarray) -> "Loop":
         """The same loop with another V: S at the knots [N+1 n n] and S' at both ends of the intervals [N 2 n n]."""
@@ -146,7 +289,7 @@ class Loop:
         return hermite(fraction, self.dt, self.values[k], self.slopes[k, 0], self.values[k + 1], self.slopes[k, 1])
 
     def axes(self, k: int, fraction: float, rho: float, growth: float) -> tuple[np.ndarray, np.ndarray]:
-        """L with L L' = rho S^-1 and its rate, where rho' = growth rho; the angle's row has its first entry alone.
+        """L with L L' = rho S^-1 and its rate, where rho' = growth rho; the first angle's row has one entry.
 
         Raises:
             Refused: between knots, S is not positive definite.
@@ -155,7 +298,7 @@ class Loop:
         check.require(float(np.linalg.eigvalsh(s)[0]) > 0, f"interval {k}", "S is not positive definite between knots")
         p = np.linalg.inv(s) * rho
         p_rate = growth * p - p @ slope @ p / rho
-        order = [self.plant.angle, *(i for i in range(self.n) if i != self.plant.angle)]
+        order = [*self.hinges, *(i for i in range(self.n) if i not in self.hinges)]
         c = np.linalg.cholesky(p[np.ix_(order, order)])
         inner = np.linalg.solve(c, np.linalg.solve(c, p_rate[np.ix_(order, order)]).T)
         c_rate = c @ (np.tril(inner, -1) + np.diag(np.diag(inner)) / 2)
@@ -167,13 +310,24 @@ class Loop:
         """The largest V' / V over the surface V = rho, searched from the sampled directions [n D]."""
         s, slope = self.value(k, fraction)
         axes, _ = self.axes(k, fraction, rho, 0.0)
-        error_rate = self.error_rate(k, fraction)
+        center, center_rate = self.nominal(k, fraction)
+        gain = (1 - fraction) * self.gains[k] + fraction * self.gains[k + 1]
 
         def rises(y: np.ndarray) -> np.ndarray:
             error = axes @ y
-            return np.sum((s @ error) * (2 * error_rate(error)) + error * (slope @ error), axis=0) / rho
+            asked = self.u[k] - gain @ error
+            worst = self._fastest(center[:, None] + error, s @ error, asked, self.late[k])
+            return (2 * (worst - center_rate @ (s @ error)) + np.sum(error * (slope @ error), axis=0)) / rho
 
         return _highest(rises, directions)
+
+    def _fastest(self, x: np.ndarray, weight: np.ndarray, asked: np.ndarray, late: float) -> np.ndarray:
+        """The largest weight'x' [D] of the robots' control points and the inputs about those asked; x [n D]."""
+        determinant, a, b = self._points.field(self.robot, x)
+        free, forced = (np.einsum("nd,njd->jd", weight, each) / determinant for each in (a, b))
+        (weak, strong), w = self.limits, self.disturbance
+        low, high = np.clip(asked - late, -strong, weak) - w, np.clip(asked + late, -weak, strong) + w
+        return np.max(free + np.maximum(forced * low, forced * high), axis=0)
 
     def drift(self, k: int, fraction: float, axes: np.ndarray, y: np.ndarray) -> np.ndarray:
         """y'L^-1 (f(x* + L y, u) - x*') [D] for directions y [n D] of an ellipsoid L."""
@@ -191,7 +345,7 @@ class Loop:
     def goal_box_level(self) -> float:
         """As `box_level`; half a turn away is another equilibrium, which no goal region has in it."""
         clearance = self.bounds - np.abs(self.goal)
-        clearance[self.plant.angle] = min(clearance[self.plant.angle], np.pi)
+        clearance[self.hinges] = np.minimum(clearance[self.hinges], np.pi)
         return _touching(clearance, self.values[-1])
 
     def goal_growth(self, rho: float, directions: np.ndarray) -> float:
@@ -201,8 +355,8 @@ class Loop:
 
         def rises(y: np.ndarray) -> np.ndarray:
             error = axes @ y
-            u = np.clip(-self.goal_gain @ error, -self.limit, self.limit)
-            return 2 * np.sum((s @ error) * self.rate(self.goal[:, None] + error, u), axis=0) / rho
+            asked = -self.goal_gain @ error
+            return 2 * self._fastest(self.goal[:, None] + error, s @ error, asked, self.late_at_goal) / rho
 
         return _highest(rises, directions)
 

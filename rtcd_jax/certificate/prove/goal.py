@@ -21,49 +21,59 @@ NARROWEST = 1 / 64
 
 
 class GoalRegion(NamedTuple):
-    """{V <= rho} as proved, shell by shell; the funnel's outlet has the level `outlet`."""
+    """{V <= rho} as proved, shell by shell from |y| = `rest` on; the funnel's outlet has the level `outlet`."""
 
     rho: float
     outlet: float
     axes: list
     order: int
+    rest: float
     shells: list[Shell]
     margin: float
 
 
-def goal_region(claim: Claim, loop: Loop, exact: bool) -> GoalRegion | None:
-    """The region of the first level that can be proved; None if none can."""
+def goal_region(claim: Claim, loop: Loop, exact: bool, rest: float = 0.0) -> GoalRegion | None:
+    """The region of the first level that can be proved; None if none can.
+
+    Where something moves the goal, motions may stay below |y| = `rest`; the least such |y| is looked for.
+    """
     directions = unit_directions(claim.n)
     try:
         most = goal_level(loop, directions)
     except Refused:
         return None
     for fraction in LEVEL_FRACTIONS:
-        region = _at_level(claim, loop, fraction * most, exact, directions)
+        region = _at_level(claim, loop, fraction * most, exact, directions, rest)
         if region is not None:
             return region
     return None
 
 
-def _at_level(claim: Claim, loop: Loop, rho: float, exact: bool, directions: np.ndarray) -> GoalRegion | None:
+def _at_level(
+    claim: Claim, loop: Loop, rho: float, exact: bool, directions: np.ndarray, most_rest: float
+) -> GoalRegion | None:
     last, order = len(loop.u) - 1, ORDERS[claim.n]
     axes = on_grid(loop.axes(last, 1.0, rho, 0.0)[0])
-    degree, waiting, shells, least = (order + 2) // 2, [(0.0, 1.0)], [], np.inf
+    degree, waiting, shells, least, rest = (order + 2) // 2, [(0.0, 1.0)], [], np.inf, 0.0
     try:
         field = check.goal_field(claim, axes, order, "goal")
-        while waiting:
+        while waiting:  # from the outside in
             start, end = waiting.pop()
             ends = Q(*start.as_integer_ratio()), Q(*end.as_integer_ratio())
-            todo = check.goal_obligations(claim, field, *ends)
-            proof = prove(todo, degree, order + 1, exact, directions)
+            proof = None
+            if start or not claim.moves_the_goal:
+                proof = prove(check.goal_obligations(claim, field, *ends), degree, order + 1, exact, directions)
             if proof is not None:
                 shells.append(Shell(*ends, proof[0]))
                 least = min(least, proof[1])
-            elif end - start <= NARROWEST:
-                return None
-            else:
+            elif end - start > NARROWEST:
                 middle = (start + end) / 2
-                waiting += [(middle, end), (start, middle)]
+                waiting += [(start, middle), (middle, end)]
+            elif claim.moves_the_goal and end <= most_rest:
+                rest = end
+                break
+            else:
+                return None
     except Refused:
         return None
-    return GoalRegion(rho, (1 - OUTLET_CLEARANCE) * rho, axes, order, shells, least)
+    return GoalRegion(rho, (1 - OUTLET_CLEARANCE) * rho, axes, order, rest, shells[::-1], least)

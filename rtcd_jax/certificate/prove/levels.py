@@ -58,14 +58,17 @@ def products(p: np.ndarray, q: np.ndarray) -> np.ndarray:
 def goal_level(loop: Loop, directions: np.ndarray) -> float:
     """The largest level up to which V falls in the sampled directions [n D], under the limits on the states.
 
+    Where something moves the goal, V need not fall on the lowest levels.
+
     Raises:
         Refused: V falls at no level.
     """
-    levels = BOX_FRACTION * loop.goal_box_level() * np.linspace(0, 1, LEVELS + 1)
-    falls = [loop.goal_growth(level, directions) < 0 for level in levels[1:]]
-    last = falls.index(False) if False in falls else LEVELS
-    require(last > 0, "goal", "V does not fall")
-    return float(levels[last])
+    levels = BOX_FRACTION * loop.goal_box_level() * np.linspace(0, 1, LEVELS + 1)[1:]
+    falls = [loop.goal_growth(level, directions) < 0 for level in levels]
+    first = falls.index(True) if loop.claim.moves_the_goal and True in falls else 0
+    last = falls.index(False, first) if False in falls[first:] else LEVELS
+    require(last > first, "goal", "V does not fall")
+    return float(levels[last - 1])
 
 
 def carried_back(

@@ -12,6 +12,7 @@ from scipy.stats import spearmanr
 
 from rtcd_jax.certificate.prove.certify import Outcome, Step, certify_elite
 from rtcd_jax.certificate.prove.closed_loop import claim_of
+from rtcd_jax.certificate.prove.uncertainty import bounds_of, uncertainty_of
 from rtcd_jax.elite.elite import Elite
 from rtcd_jax.elite.records import require_elites
 from rtcd_jax.system.console import Clock, Console, Progress, table
@@ -25,7 +26,13 @@ RANKED = 3
 
 
 def certify_run(
-    folder: Path, elites: int, rung: str, workers: int, console: Console, optimize_value: bool = False
+    folder: Path,
+    elites: int,
+    rung: str,
+    workers: int,
+    console: Console,
+    optimize_value: bool = False,
+    uncertainty: Path | None = None,
 ) -> bool:
     """Certificates of a run's best elites; True if every funnel was shown from t = 0 to the goal.
 
@@ -37,14 +44,15 @@ def certify_run(
     """
     names = require_elites(folder)[:elites]
     for name in names:  # at once, and not from a worker
-        claim_of(Elite.read(folder, name))
+        elite = Elite.read(folder, name)
+        claim_of(elite, bounds_of(elite, uncertainty_of(elite, uncertainty)))
     target = folder / "certificates"
     make_folder(target)
     summary = target / "summary.json"
     former = read_json(summary, "remove it, or make it again") if summary.is_file() else {}
     outcomes: dict[str, Outcome | None] = {}
     clock, reached = Clock(), dict.fromkeys(names, 0.0)
-    for event in _events(folder, names, rung, workers, optimize_value):
+    for event in _events(folder, names, workers, (rung, optimize_value, uncertainty)):
         if isinstance(event, Step):
             reached[event.elite] = 1 - event.knot / event.knots
             done = sum(reached.values())
@@ -72,7 +80,7 @@ def certify_run(
 
 
 def _events(
-    folder: Path, names: Sequence[str], rung: str, workers: int, optimize_value: bool
+    folder: Path, names: Sequence[str], workers: int, how: tuple[str, bool, Path | None]
 ) -> Iterator[Step | tuple[str, Outcome | None]]:
     """Steps of all elites as they come, and every elite's outcome by its name."""
     # One thread each: there is a worker for every core, and small matrices in many threads cost ten times as much.
@@ -80,7 +88,7 @@ def _events(
         os.environ.setdefault(library, "1")
     steps = CONTEXT.Queue()
     with processes(min(workers, len(names)), _remember, steps) as pool:
-        waiting: dict[Future, str] = {pool.submit(_work, folder, name, rung, optimize_value): name for name in names}
+        waiting: dict[Future, str] = {pool.submit(_work, folder, name, *how): name for name in names}
         while waiting:
             with contextlib.suppress(queue.Empty):
                 yield steps.get(timeout=POLL)
@@ -97,8 +105,8 @@ def _remember(steps: Any) -> None:
     _steps = steps
 
 
-def _work(folder: Path, name: str, rung: str, optimize_value: bool) -> Outcome | None:
-    return certify_elite(folder, name, rung, _steps.put, optimize_value)
+def _work(folder: Path, name: str, rung: str, optimize_value: bool, uncertainty: Path | None) -> Outcome | None:
+    return certify_elite(folder, name, rung, _steps.put, optimize_value, uncertainty)
 
 
 def rank_correlation(outcomes: Sequence[Outcome]) -> float:

@@ -1,0 +1,66 @@
+"""The input: what the motor gives lies between two saturated laws, and which of their cases occur.
+
+The feedback acts on a measurement, up to `age` old, with errors up to `noise`: it is u_lin + e with |e| <= error. The
+motor's limit F lies in [F-, F+], and |w| <= `disturbance` comes on top. So
+
+    clip(u_lin - error, -F+, F-) - w  <=  u  <=  clip(u_lin + error, -F-, F+) + w,
+
+and what is affine in u and positive at both ends is positive at u.
+"""
+
+import math
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+from rtcd_jax.certificate.check.claim import Claim
+from rtcd_jax.certificate.check.exact import Q
+from rtcd_jax.certificate.check.matrix import dot
+from rtcd_jax.certificate.check.squares import is_positive
+from rtcd_jax.certificate.check.taylor import Space
+
+
+class Case(NamedTuple):
+    """A case of a saturated law: the `input` where all of `where` are >= 0; `saturated` if it is a number."""
+
+    where: list
+    input: Any
+    saturated: bool
+
+
+def input_error(claim: Claim, k: int) -> Any:
+    """A bound of the error of the feedback on interval k: its gains lie between those of the knots around it."""
+    oldest = max(0, k - math.ceil(claim.age / claim.dt))
+    return error_under(claim, claim.K[oldest : k + 2])
+
+
+def error_under(claim: Claim, gains: Sequence[Sequence]) -> Any:
+    """A bound of the error of the feedback whose gains lie between those of the rows."""
+    largest = [max(abs(gain) for gain in column) for column in zip(*gains, strict=True)]
+    return dot(largest, claim.noise) + claim.age * claim.speed
+
+
+def cases_of(space: Space, claim: Claim, error, feedforward, linear, bound_squared, low, high) -> dict[str, Case]:
+    """By name, for u_lin = feedforward + linear: "free", "high" and "low", each with "-" and "+" where the laws differ.
+
+    |linear|^2 <= bound_squared on the sphere, for s in [low, high]. What cannot occur is left out.
+    """
+    weak, strong = claim.limits
+    w = claim.disturbance
+    laws = {"-": (-error, strong, weak, -w), "+": (error, weak, strong, w)}
+    if error == 0 and weak == strong and w == 0:
+        laws = {"": laws["+"]}
+    cases = {}
+    for sign, (shift, lower, upper, on_top) in laws.items():
+        middle = feedforward + shift
+        clearance = {"high": space.poly(upper - middle) - linear, "low": space.poly(lower + middle) + linear}
+        occurs = [
+            case
+            for case, left in (("high", upper - middle), ("low", lower + middle))
+            if not (left > 0 and is_positive(space.poly(left * left) - bound_squared, {0: (low, high)}, depth=4))
+        ]
+        law = space.poly(middle + on_top) + linear
+        cases[f"free{sign}"] = Case([clearance[case] for case in occurs], law, False)
+        ends = {"high": upper + on_top, "low": on_top - lower}
+        for case in occurs:
+            cases[case + sign] = Case([clearance[case] * Q(-1)], space.poly(ends[case]), True)
+    return cases

@@ -1,0 +1,398 @@
+"""Certificates that bear a box of robots, disturbances, errors and old measurements; and files of version 1."""
+
+import copy
+import gzip
+import json
+import random
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from rtcd_jax.certificate import check
+from rtcd_jax.certificate.check import Q, Refused
+from rtcd_jax.certificate.falsify.falsify import Part, summed
+from rtcd_jax.certificate.falsify.simulation import Motions
+from rtcd_jax.certificate.prove.certify import certify_elite
+from rtcd_jax.certificate.prove.closed_loop import ControlPoints, rate
+from rtcd_jax.certificate.standing import standing, standing_of
+from rtcd_jax.cli import main as cli
+from rtcd_jax.elite.elite import Elite
+from tests.certificate import swing
+from tests.certificate.folder import folder_with
+from tests.certificate.test_check import nudged, refusal, resealed
+from tests.certificate.test_theorems import anywhere, shown
+
+VERSION_1 = Path(__file__).parent / "files" / "version1.json.gz"
+"""Of the elite of `swing.py`, by a checker that knew no other version."""
+MARGIN_THEN, INLET_THEN = 0.8240586116152051, 9.592102479145328
+
+BOX = """
+uncertainty:
+  design: {mass: 0.03, length: 0.02}
+  input_limit: 0.02
+  input: 0.05
+  noise: [0.001, 0.002]
+  age: 0.0005
+"""
+
+
+@pytest.fixture(scope="module")
+def bearing(tmp_path_factory):
+    """A run folder whose elite is certified under all kinds of uncertainty at once."""
+    folder = folder_with(tmp_path_factory.mktemp("bearing"), *swing.elite())
+    (folder / "box.yaml").write_text(BOX)
+    outcome = certify_elite(folder, "000", "proved", lambda step: None, uncertainty=folder / "box.yaml")
+    assert outcome is not None
+    assert outcome.whole
+    return folder
+
+
+@pytest.fixture(scope="module")
+def borne_text(bearing):
+    return (bearing / "certificates" / "000.json").read_text()
+
+
+@pytest.fixture
+def borne(borne_text):
+    return json.loads(borne_text)
+
+
+# Version 1 ------------------------------------------------------------------------------------------------------------
+
+
+def test_a_file_of_version_1_has_the_verdict_that_it_had(content):
+    """And an elite without uncertainty has the same margin and volumes in version 2."""
+    old = json.loads(gzip.decompress(VERSION_1.read_bytes()))
+    then, now = check.check(old), check.check(content)
+    assert then.margin == pytest.approx(MARGIN_THEN, rel=1e-7)
+    assert then.volumes["inlet"] == INLET_THEN
+    assert now.margin == pytest.approx(then.margin, rel=1e-6)
+    assert now.volumes == then.volumes
+    assert np.allclose(now.rest, then.rest, rtol=1e-6, atol=0)
+    old["claim"]["parameters"]["m"] = nudged(old["claim"]["parameters"]["m"], 0.5)
+    assert refusal(resealed(old))
+
+
+def test_a_file_of_version_1_proves_its_elite(tmp_path):
+    file = tmp_path / "000.json"
+    file.write_bytes(gzip.decompress(VERSION_1.read_bytes()))
+    arrays, record = swing.elite()
+    assert standing_of(file, Elite.of(arrays, record)).proved
+    heavier = {**record, "parameters": {**record["parameters"], "m": 0.7}}
+    assert "parameters.m = 0.6 there, 0.7 in the elite" in standing_of(file, Elite.of(arrays, heavier)).reason
+
+
+# Disturbances on both sides of known thresholds -----------------------------------------------------------------------
+
+
+def falls(radius, w, cubic=0):
+    """Whether |x| = radius is shown to shrink under x' = -x + cubic x^3 + w z for both signs of w; x = radius z."""
+    signs = [
+        anywhere(check.polynomial(1, {(0, 2): _exact(radius), (0, 4): _exact(-cubic * radius**3), (0, 1): _exact(-v)}))
+        for v in (w, -w)
+    ]
+    return all(shown(each, 2) is not None for each in signs)
+
+
+def _exact(value):
+    return Q(*float(value).as_integer_ratio())
+
+
+def test_a_disturbed_line_stays_within_its_disturbance():
+    assert falls(1.01, 1.0)
+    assert not falls(0.99, 1.0)
+
+
+def test_a_disturbed_cubic_field_has_the_interval_between_its_roots():
+    """x' = -x + x^3 + w: between the two positive roots of r - r^3 = w."""
+    w = 0.2
+    small, large = sorted(r.real for r in np.roots([1, 0, -1, w]) if r.real > 0)
+    assert falls(1.01 * small, w, 1)
+    assert falls(0.99 * large, w, 1)
+    assert not falls(0.99 * small, w, 1)
+    assert not falls(1.01 * large, w, 1)
+
+
+# Robots ---------------------------------------------------------------------------------------------------------------
+
+
+def wide(content):
+    """A claim with a wide box, and its first interval."""
+    claim = check.read_claim(check.Node("claim", content["claim"]))
+    parameters = {"m": (Q(1, 2), Q(7, 10)), "l": (Q(3, 10), Q(1, 2)), "b": (Q(0), Q(1, 5)), "g": claim.parameters["g"]}
+    claim = claim._replace(parameters=parameters)
+    return claim, check.read_interval(check.Node("interval", content["funnel"][0]), claim)
+
+
+def numeric(polynomial, s, y):
+    return sum(float(c) * s ** e[0] * np.prod(np.power(y, e[1 : len(y) + 1])) for e, c in check.terms_of(polynomial))
+
+
+def decrease(claim, interval, s, y, numbers):
+    """q of one robot, where its input is free."""
+    data = check.motion(claim, interval)
+    axes, slope = (
+        np.array([[numeric(entry, s, y) for entry in row] for row in each]) for each in (data.axes, data.axes_rate)
+    )
+    state, speed, gain = (np.array([numeric(each, s, y) for each in v]) for v in (data.state, data.rate, data.gain))
+    u = float(data.input) - gain @ axes @ y
+    moving = rate(claim.robot, numbers, (state + axes @ y)[:, None], u)[:, 0] - speed - slope @ y
+    middle = {name: float(low + high) / 2 for name, (low, high) in claim.parameters.items()}
+    at_center = np.array([[numeric(entry, 0.0, y) for entry in row] for row in data.axes])
+    scale = 2 / (middle["m"] * middle["l"] ** 2 * np.linalg.det(at_center))
+    return -scale * numbers["m"] * numbers["l"] ** 2 * np.linalg.det(axes) * (y @ np.linalg.solve(axes, moving))
+
+
+def test_no_robot_of_the_box_is_worse_than_all_control_points(content):
+    claim, interval = wide(content)
+    todo = check.funnel_obligations(claim, interval, "interval")
+    free = {name: each for name, each in todo.items() if name.startswith("free")}
+    assert len(free) == 2 * 3 * 2, "affine in m and b, quadratic in l"
+    error = float(next(iter(free.values())).error)
+    dice = np.random.default_rng(0)
+    for _ in range(20):
+        s, y = dice.uniform(-1, 1), dice.normal(size=2)
+        y /= np.linalg.norm(y)
+        least = min(numeric(each.p, s, y) for each in free.values())
+        for _ in range(50):
+            numbers = {name: dice.uniform(float(low), float(high)) for name, (low, high) in claim.parameters.items()}
+            assert decrease(claim, interval, s, y, numbers) >= least - error - 1e-9
+
+
+def test_corners_of_the_box_are_not_enough():
+    """m l^2 - 4/5 m l with m in [1, 2], l in [3/10, 1/2]: least at l = 2/5, which no corner shows."""
+    space = check.Space(1, 0, 0, 2)
+    mass, length = space.between(Q(1), Q(2), 0).p, space.between(Q(3, 10), Q(1, 2), 1).p
+    moment = mass * length
+    points = check.control_points(moment * length - moment * Q(4, 5), 1)
+    points = {place: float(numeric(p, 0.0, (0,))) for place, p in points.items()}
+    values = [m * r * r - 0.8 * m * r for m in np.linspace(1, 2, 11) for r in np.linspace(0.3, 0.5, 21)]
+    assert points.keys() == {"0,0", "0,1", "0,2", "1,0", "1,1", "1,2"}
+    assert min(points.values()) <= min(values) < min(points[place] for place in ("0,0", "0,2", "1,0", "1,2"))
+
+
+def test_the_prover_s_control_points_are_the_field_s(content):
+    """Their means by the Bernstein weights are the fields of robots inside the box."""
+    claim, _ = wide(content)
+    points = ControlPoints.of(claim)
+    x = np.array([[0.3, 2.0], [1.0, -4.0]])
+    determinant, a, b = points.field(claim.robot, x)
+    assert determinant.shape == (12, 2)
+    middle = {name: (float(low) + float(high)) / 2 for name, (low, high) in claim.parameters.items()}
+    weights = np.kron(np.kron([0.5, 0.5], [0.25, 0.5, 0.25]), [0.5, 0.5])
+    expected = rate(claim.robot, middle, x, 1.5)
+    found = (np.einsum("j,njd->nd", weights, a) + 1.5 * np.einsum("j,njd->nd", weights, b)) / (weights @ determinant)
+    np.testing.assert_allclose(found, expected, rtol=1e-12)
+
+
+def test_every_input_lies_between_the_two_laws(content):
+    claim = check.read_claim(check.Node("claim", content["claim"]))
+    weak, strong, error, w = 2.0, 2.5, 0.3, 0.1
+    claim = claim._replace(limits=(Q(2), Q(5, 2)), disturbance=Q(1, 10))
+    space = check.Space(2, 2, 2)
+    cases = check.cases_of(space, claim, Q(3, 10), Q(1), space.y(0) * Q(4), Q(16), Q(-1), Q(1))
+    assert {name[:-1] for name in cases} == {"free", "high", "low"}
+    dice = np.random.default_rng(0)
+    for _ in range(300):
+        y = dice.normal(size=2)
+        y /= np.linalg.norm(y)
+        laws = {"-": [], "+": []}
+        for name, case in cases.items():
+            if all(numeric(condition, 0.0, y) >= 0 for condition in case.where):
+                laws[name[-1]].append(numeric(case.input, 0.0, y))
+        asked = 1 + 4 * y[0] + dice.uniform(-error, error)
+        limit = dice.uniform(weak, strong)
+        u = np.clip(asked, -limit, limit) + dice.uniform(-w, w)
+        assert min(laws["-"]) - 1e-12 <= u <= max(laws["+"]) + 1e-12
+
+
+def test_the_mass_matrix_must_be_definite_for_all_robots_and_angles():
+    cartpole = check.PLANTS["cartpole"].robot
+    exact = {"Mc": 1.0, "Mp": 0.2, "lp": 0.2, "inertia_about_com": 0.003}
+    box = {name: (_exact(value), _exact(value)) for name, value in exact.items()}
+    assert check.mass_is_definite(cartpole, box)
+    assert check.mass_is_definite(cartpole, box | {"Mp": (Q(1, 10), Q(3)), "lp": (Q(1, 10), Q(1))})
+    # (Mc + Mp)(I + Mp lp^2) > (Mp lp)^2 holds upright as long as Mc (I + Mp lp^2) + Mp I > 0: lost at Mc < -0.055
+    threshold = -0.2 * 0.003 / (0.003 + 0.2 * 0.04)
+    assert check.mass_is_definite(cartpole, box | {"Mc": (_exact(threshold * 0.99),) * 2})
+    assert not check.mass_is_definite(cartpole, box | {"Mc": (_exact(threshold * 1.01),) * 2})
+    assert not check.mass_is_definite(cartpole, box | {"Mc": (_exact(threshold * 1.01), Q(1))})
+
+
+# A whole certificate --------------------------------------------------------------------------------------------------
+
+
+def test_it_says_what_it_bears(borne):
+    report = check.check(borne)
+    words = check.sentence(report)
+    for part in (
+        "for every robot 'pendulum' with m in [0.582, 0.618], l in [0.392, 0.408], b = 0.1",
+        "a limit in [2.45, 2.55] N m",
+        "every disturbance |w(t)| <= 0.05 N m",
+        "theta +-0.001 rad, theta_dot +-0.002 rad/s",
+        "measured at most 0.0005 s ago",
+        "comes and stays within theta +-",
+        "an impulse of up to",
+    ):  # fmt: skip
+        assert part in words
+    assert 0 < max(report.rest) < 1
+    assert {case.split("/")[0][-1] for case in borne["funnel"][0]["cases"]} == {"-", "+"}
+
+
+def test_no_motion_of_any_robot_leaves_and_worse_ones_do(borne):
+    def followed(beyond):
+        return summed([Part.of(Motions(borne, beyond).follow(400, 16, np.random.default_rng(3)))], 16)
+
+    once = followed(1.0)
+    assert once.broken == 0
+    assert once.level > 0.99
+    assert followed(4.0).left_funnel > 0
+
+
+def test_the_elite_is_one_of_its_robots(bearing, borne):
+    assert standing(bearing, "000").proved
+    arrays, record = swing.elite()
+    file = bearing / "certificates" / "000.json"
+    for name, value in (("m", 0.61), ("l", 0.395)):
+        other = {**record, "parameters": {**record["parameters"], name: value}}
+        # another robot of the box; its own nominal motion has other rates
+        assert "rates" in standing_of(file, Elite.of(arrays, other)).reason
+    heavy = {**record, "parameters": {**record["parameters"], "m": 0.7}}
+    assert "parameters.m in [0.58" in standing_of(file, Elite.of(arrays, heavy)).reason
+
+
+def _at(content, *path):
+    for key in path:
+        content = content[key]
+    return content
+
+
+def _raise(*path, to=None, factor=1.0, add=0.0):
+    def change(content):
+        *parents, last = path
+        node = _at(content, *parents)
+        node[last] = (to if to is not None else float.fromhex(node[last]) * factor + add).hex()
+
+    return change
+
+
+LIES = {
+    "a heavier robot": (_raise("claim", "parameters", "m", 1, factor=1.3), "goal"),
+    "a longer robot": (_raise("claim", "parameters", "l", 1, factor=1.3), "goal"),
+    "uncertain damping": (_raise("claim", "parameters", "b", 1, factor=2.0), "must have the cases"),
+    "a weaker motor": (_raise("claim", "limit", 0, factor=0.5), "goal"),
+    "a stronger disturbance": (_raise("claim", "disturbance", factor=8.0), "goal"),
+    "a worse encoder": (_raise("claim", "noise", 1, factor=200.0), "goal"),
+    "an older measurement": (_raise("claim", "age", factor=30.0), "goal"),
+    "a slower feedback": (_raise("claim", "speed", factor=0.5), "the feedback may change by"),
+    "a lower rest": (_raise("goal", "rest", factor=0.5), "goal.shells[0]: starts at"),
+    "no rest": (_raise("goal", "rest", to=0.0), "must have a rest > 0"),
+    "a larger push": (_raise("claim", "push", factor=1.01), "may leave the funnel"),
+    "another inertia": (
+        _raise("claim", "robot", "mass", 0, 0, 0, "cos", factor=1.5),
+        "goal",
+    ),
+    "no gravity": (_raise("claim", "robot", "potential", 0, "cos", factor=-1.0), "goal"),
+}
+
+
+@pytest.mark.parametrize("lie", LIES)
+def test_what_it_does_not_bear_is_refused_with_its_place(borne, lie):
+    change, reason = LIES[lie]
+    change(borne)
+    assert reason in refusal(resealed(borne))
+
+
+def test_a_missing_case_is_refused(borne):
+    cases = borne["funnel"][1]["cases"]
+    del cases[next(name for name in cases if name.startswith("free-"))]
+    assert "funnel[1].cases: must have the cases" in refusal(resealed(borne))
+
+
+def test_the_push_margin_is_that_of_impulses_at_fine_instants(borne):
+    """It is a lower bound, and within 1 % of what a grid of instants and the box's corners allow."""
+    claim = check.read_claim(check.Node("claim", borne["claim"]))
+    least = np.inf
+    for i, each in enumerate(borne["funnel"]):
+        data = check.motion(claim, check.read_interval(check.Node(f"funnel[{i}]", each), claim))
+        for s in np.linspace(-1, 1, 41):
+            axes = np.array([[numeric(entry, s, (0, 0)) for entry in row] for row in data.axes])
+            inertia = float(claim.parameters["m"][0] * claim.parameters["l"][0] ** 2)
+            least = min(least, 1 / np.linalg.norm(np.linalg.solve(axes, [0, 1 / inertia])))
+    assert 0.99 * least < float(claim.push) <= least
+
+
+# Configurations -------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("text", "reason"),
+    [
+        ("design: {weight: 0.1}", "no number of the pendulum is 'weight'; "),
+        ("input: -1", "input = -1: must be >= 0"),
+        ("noise: [0.1]", "uncertainty.noise: has 1 entries, must have 2"),
+        ("inptu: 1", "inptu"),
+    ],
+)
+def test_an_uncertainty_that_is_none_is_told_in_a_line(tmp_path, capsys, text, reason):
+    run = folder_with(tmp_path / "run", *swing.elite())
+    (tmp_path / "box.yaml").write_text(text)
+    assert cli.main(["certify", str(run), "--uncertainty", str(tmp_path / "box.yaml")]) == 2
+    assert reason in capsys.readouterr().err
+
+
+def test_what_the_run_bears_is_certified_unless_told_otherwise(tmp_path, monkeypatch):
+    arrays, record = swing.elite()
+    run = folder_with(tmp_path / "run", arrays, record | {"uncertainty": {"input": 0.05}})
+    assert certify_elite(run, "000", "certified", lambda step: None) is not None
+    claim = json.loads((run / "certificates" / "000.json").read_text())["claim"]
+    assert float.fromhex(claim["disturbance"]) == 0.05
+    assert certify_elite(run, "000", "certified", lambda step: None, uncertainty=Path("none")) is not None
+    claim = json.loads((run / "certificates" / "000.json").read_text())["claim"]
+    assert float.fromhex(claim["disturbance"]) == 0.0
+
+
+# Mutations ------------------------------------------------------------------------------------------------------------
+
+STATEMENT = [
+    ("claim", "parameters", "m", 1), ("claim", "parameters", "m", 0), ("claim", "parameters", "l", 1),
+    ("claim", "parameters", "b", 1), ("claim", "limit", 0), ("claim", "limit", 1), ("claim", "disturbance"),
+    ("claim", "noise", 0), ("claim", "noise", 1), ("claim", "age"), ("claim", "speed"), ("claim", "push"),
+    ("goal", "rest"), ("claim", "robot", "mass", 0, 0, 0, "cos"), ("claim", "robot", "potential", 0, "cos"),
+    ("claim", "robot", "motor", 0, 0, "cos"), ("claim", "K_goal", 1), ("claim", "u", 1), ("claim", "dt"),
+]  # fmt: skip
+
+
+def judged(text, rounds, seed):
+    """Counts of accepted and refused; whatever is accepted must not be falsified."""
+    dice, counts = random.Random(seed), {"accepted": 0, "refused": 0}
+    for _ in range(rounds):
+        content, path = json.loads(text), dice.choice(STATEMENT)
+        factor = dice.choice([1 + 2.0**-40, 1 - 2.0**-40, 1.001, 0.999, 1.03, 0.97, 1.3, 0.7, 4.0, -1.0])
+        _raise(*path, factor=factor)(content)
+        if content == json.loads(text):
+            continue
+        with pytest.raises(Refused, match="was changed: its digest is another"):
+            check.check(copy.deepcopy(content))
+        try:
+            check.check(resealed(content))
+        except Refused:
+            counts["refused"] += 1
+            continue
+        counts["accepted"] += 1
+        found = summed([Part.of(Motions(content).follow(200, 16, np.random.default_rng(0)))], 16)
+        assert found.left_funnel == found.left_limits == 0, (path, factor)
+    return counts
+
+
+def test_mutated_statements_are_refused_or_true(borne_text):
+    counts = judged(borne_text, 12, 1)
+    assert counts["refused"] > 3
+
+
+@pytest.mark.slow
+def test_hundreds_of_mutated_statements_are_refused_or_true(borne_text):
+    counts = judged(borne_text, 400, 2)
+    assert counts["refused"] > 100
+    assert counts["accepted"] > 20
