@@ -348,7 +348,7 @@ class Refinement:
 
     def _fractions(self, places: Float[Array, " S"] | float) -> Float[Array, " S"]:
         """Of an interval, from the places [0, 1] of the instants in their cells."""
-        return (np.arange(self._cells) + places) / self._cells
+        return (jnp.arange(self._cells) + places) / self._cells
 
     def _instants(self, start: Start, shape: Shape, fractions: Float[Array | np.ndarray, " S"]) -> Instants:
         """At these fractions of every interval, in the order of time."""
@@ -382,7 +382,7 @@ class Refinement:
         at = self._finished(*map(often, arrays), widest=np.pi)
         return at, at.box[0] + 2 * jnp.log(jnp.arange(1, GOAL_LEVELS + 1) / GOAL_LEVELS)
 
-    def _finished(self, values, rates, centers, center_rates, gains, inputs, widest: float = np.inf) -> Instants:
+    def _finished(self, values, rates, centers, center_rates, gains, inputs, *, widest: float = np.inf) -> Instants:
         factors = cholesky(values)[0]
         limits = jnp.asarray(np.minimum(self.problem.state_limits, LARGEST_STATE), values.dtype)[:, None]
         widest = min(widest, WIDEST.get(self._n, WIDEST_OF_MANY))
@@ -438,7 +438,8 @@ class Refinement:
         `uncertainty.residual`, or next to the goal.
         """
         falls = growth < 0
-        uncertain = self.problem.uncertainty is not None
+        uncertainty = self.problem.uncertainty
+        uncertain = uncertainty is not None
         # Below the first level from which V falls lies what the disturbance keeps away from the goal.
         first = jnp.argmax(falls) if uncertain else 0
         bad = ~falls & (jnp.arange(GOAL_LEVELS) >= first)
@@ -450,9 +451,9 @@ class Refinement:
         last = jnp.where(jnp.any(falls), last, levels[0])
         radii = jnp.arange(1, GOAL_LEVELS + 1) / GOAL_LEVELS
         inner = growth[0]
-        if uncertain:
+        if uncertainty is not None:
             reach = jax.lax.stop_gradient(jnp.exp((last - goal.box[0]) / 2))
-            inner = jnp.interp(share * self.problem.uncertainty.residual * reach, radii, growth)
+            inner = jnp.interp(share * uncertainty.residual * reach, radii, growth)
         slowest = jnp.where(jnp.any(falls), inner, jnp.min(growth)) + GOAL_DECAY
         return last, jnp.maximum(slowest, 0.0)
 

@@ -89,6 +89,15 @@ class Robot(NamedTuple):
         known, derived = self.complete(values), (named for named, _ in self.derived)
         return {named.symbol: known[named.name] for named in (*self.design, *self.constants, *derived)}
 
+    def numbers(self, parameters: Mapping[str, Any]) -> dict[str, Any]:
+        """Every number by name, from the stored parameters, which may say another one of what follows from others.
+
+        Raises:
+            UserError: one is missing.
+        """
+        stored = {named.name: parameters[named.symbol] for named, _ in self.derived if named.symbol in parameters}
+        return self.complete(self.values(parameters)) | stored
+
     def values(self, parameters: Mapping[str, Any]) -> dict[str, Any]:
         """The inverse of `parameters`. Raises UserError if one is missing."""
         return {named.name: parameter(parameters, named.symbol) for named in (*self.design, *self.constants)}

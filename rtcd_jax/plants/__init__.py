@@ -62,8 +62,8 @@ def model_of(config: PlantConfig, parameters: Mapping[str, float]) -> Any:
     assert isinstance(config, RobotPlant)
     from rtcd_jax.plants.model import recompiled
 
-    robot = config.with_parameters(parameters).robot()
-    return recompiled(robot, robot.complete(robot.values(parameters)))
+    robot = config.robot()
+    return recompiled(robot, robot.numbers(parameters))
 
 
 def dynamics_of(config: PlantConfig, parameters: Mapping[str, float], states: int) -> Callable[..., np.ndarray]:
@@ -75,7 +75,7 @@ def dynamics_of(config: PlantConfig, parameters: Mapping[str, float], states: in
     if isinstance(config, RobotPlant):
         from rtcd_jax.plants.mjcf import dynamics
 
-        return dynamics(config.with_parameters(parameters).robot(), parameters)
+        return dynamics(config.robot(), parameters)
     from rtcd_jax.plants.model import CpuDynamics
 
     return CpuDynamics(model_of(config, parameters), states)

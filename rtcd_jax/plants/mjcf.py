@@ -82,7 +82,7 @@ def dynamics(robot: Robot, parameters: Mapping[str, float]) -> Callable[[np.ndar
         UserError: a parameter is missing.
     """
     form, nv = closed_form(robot), len(robot.joints)
-    lumped = form.lump(robot.complete(robot.values(parameters)))
+    lumped = form.lump(robot.numbers(parameters))
 
     def f(x: Float[np.ndarray, "S n"], u: Float[np.ndarray, "S m"]) -> Float[np.ndarray, "S n"]:
         q, v = x.T[:nv], x.T[nv:]

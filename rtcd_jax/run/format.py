@@ -46,13 +46,16 @@ def arrays_of(problem: Problem, evaluation: Evaluation) -> dict[str, np.ndarray]
     }
 
 
-def evaluation_of(problem: Problem, arrays: Mapping[str, np.ndarray], record: Mapping[str, Any]) -> Evaluation:
+def evaluation_of(problem: Problem, arrays: Mapping[str, Any], record: Mapping[str, Any]) -> Evaluation:
     """The evaluation that `arrays_of` and `record_of` stored, of a candidate that has a funnel."""
-    trajectory, ok = record["trajectory"], np.int32(Status.OK)
+    ok: Any = np.int32(Status.OK)
+    trajectory: dict[str, Any] = {
+        name: np.asarray(record["trajectory"][name]) for name in ("cost", "defect", "iterations")
+    }
     path = arrays["u"], arrays["x"], arrays["time"][1]
-    motion = Trajectory(*path, *(np.asarray(trajectory[name]) for name in ("cost", "defect", "iterations")), ok)
+    motion = Trajectory(*path, **trajectory, status=ok)
     policy = Policy(motion, arrays["K"], arrays["S"], ok, arrays.get("S_rates"))
-    borne = None if problem.uncertainty is None else np.ones(())
+    borne = None if problem.uncertainty is None else jnp.ones(())
     funnel = Funnel(policy, arrays["rho"], arrays["trials"], ok, borne)
     candidate = jax.device_get(decode(problem, jnp.asarray(arrays["genome"])))
     volumes = jax.device_get(funnel_volume(funnel, input_jumps(problem, candidate, motion)))

@@ -123,7 +123,7 @@ def test_the_run_keeps_its_promise(finished, small):
     for name in ("000", "initial"):
         found = json.loads((finished / "verification" / f"{name}.json").read_text())
         assert found["kept"]
-        assert set(found["witnesses"]) == {"C MuJoCo", "closed form"}
+        assert set(found["witnesses"]) == {"C MuJoCo", "RK45"}
 
 
 def _kill_after(small: Small, folder: Path, generation: int, delay: float) -> int:

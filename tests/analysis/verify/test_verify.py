@@ -29,7 +29,7 @@ INERTIA = PARAMETERS["m"] * PARAMETERS["l"] ** 2
 WEIGHT = PARAMETERS["m"] * PARAMETERS["g"] * PARAMETERS["l"]
 UPRIGHT = np.array([np.pi, 0.0])
 HELD = 0.2  # a level whose ellipsoid reaches 0.14 rad, far inside the upright's region of attraction
-SIMULATORS = ("C MuJoCo", "closed form")
+SIMULATORS = ("C MuJoCo", "RK45")
 
 
 def _pendulum(x, u):
@@ -234,10 +234,10 @@ def test_limits_are_watched_between_the_knots(speed_limit):
 def test_a_promise_is_refuted_only_where_the_interval_lies_above_it():
     """The same failures refute a small epsilon and not one above their lower bound."""
     result = verified(_held(10 * HELD))
-    lower, _ = result.interval("closed form")
+    lower, _ = result.interval("RK45")
     assert lower > 0
-    assert not dataclasses.replace(result, epsilon=1.001 * lower).refutes("closed form")
-    assert dataclasses.replace(result, epsilon=0.999 * lower).refutes("closed form")
+    assert not dataclasses.replace(result, epsilon=1.001 * lower).refutes("RK45")
+    assert dataclasses.replace(result, epsilon=0.999 * lower).refutes("RK45")
 
 
 def _store(folder, name: str, elite: Elite, **changes) -> None:
@@ -266,7 +266,7 @@ def test_verify_run_stores_what_it_found_and_tells_it(tmp_path):
         for found in record["witnesses"].values():
             assert sum(found["failures_per_knot"]) == found["failures"]
             assert found["rate_lower"] <= found["rate"] == found["failures"] / 60 <= found["rate_upper"]
-    assert broken["witnesses"]["closed form"]["failures"] > 0
+    assert broken["witnesses"]["RK45"]["failures"] > 0
     rows = [line.split() for line in screen.text.splitlines()]
     verdicts = [(row[0], " ".join(row[-2:])) for row in rows if row and row[0] in ("000", "initial")]
     refuted = [("initial", "(0.99) REFUTED")] * 2
@@ -288,9 +288,9 @@ def test_verify_run_reports_an_initial_candidate_without_a_funnel(tmp_path):
 
 def test_chunks_do_not_change_a_verdict(monkeypatch):
     elite = _held(10 * HELD)
-    whole = verified(elite, states=50).outcomes["closed form"]
+    whole = verified(elite, states=50).outcomes["RK45"]
     monkeypatch.setattr("rtcd_jax.analysis.verify.verification.CHUNK", 7)
-    parts = verified(elite, states=50).outcomes["closed form"]
+    parts = verified(elite, states=50).outcomes["RK45"]
     assert whole.failed.any()
     for kind in ("left_funnel", "left_limits", "missed_goal"):
         np.testing.assert_array_equal(getattr(parts, kind), getattr(whole, kind))
