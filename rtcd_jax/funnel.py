@@ -14,7 +14,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Int, PRNGKeyArray
+from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from rtcd_jax import rollout
 from rtcd_jax.adversary import Opponent
@@ -84,7 +84,13 @@ def estimate_funnel(
     return Funnel(policy, levels, samples, status, borne)
 
 
-def knot_levels(rollouts: Rollouts, boxes, last, key, budget: SamplingBudget):
+def knot_levels(
+    rollouts: Rollouts,
+    boxes: Float[Array, " knots"],
+    last: Float[Array, ""],
+    key: PRNGKeyArray,
+    budget: SamplingBudget,
+) -> Float[Array, " knots"]:
     """Levels [N+1] backward from the `last` one."""
     n, dtype, funnel = rollouts.problem.plant.n, boxes.dtype, budget.funnel
 
@@ -161,7 +167,15 @@ def _saturating_radius(problem, policy, goal_set: Ellipsoids):
     return jnp.min(jnp.asarray(problem.input_limits, largest.dtype) / largest)
 
 
-def goal_level(problem, candidate, policy, goal_set: Ellipsoids, box, key, budget: SamplingBudget):
+def goal_level(
+    problem: Problem,
+    candidate: Candidate,
+    policy: Policy,
+    goal_set: Ellipsoids,
+    box: Float[Array, ""],
+    key: PRNGKeyArray,
+    budget: SamplingBudget,
+) -> Float[Array, ""]:
     """rho_N: V decreases over `horizon` from every sampled state below it, inside the boxes.
 
     V then decreases at all multiples of the horizon, so that every state arrives: a Lyapunov function of the map over

@@ -84,7 +84,7 @@ def test_help_of_optimize_names_every_key_with_unit_and_default(arguments):
     text = flat(output)
     options = {option.split(" ")[0].rstrip(","): option for option in re.split(r" --(?=\w)", text)}
     for key in keys(resolved(load(Path(RTCD)))):
-        if key.endswith(".pinned"):
+        if key.endswith(".pinned") or key == "search.refine":  # --search.refine, --search.no-refine
             continue
         assert "(default: " in options[key], key
         assert re.search(r"\[.+\]", options[key]) or "{" in options[key], key
@@ -154,7 +154,7 @@ def test_all_errors_of_a_file_at_once(tmp_path):
         "  trajectory.knots = 'many': must be a whole number; knots N+1 of the nominal motion [-] (paper, section III)",
         "  funnel.confidence = 1.0: must be > 0 and < 1; 1 - beta, jointly over the knots [-]",
         "  search.sed = 0: unknown key; did you mean 'seed'? Valid: objective, at_least, mode, population, "
-        "generations, sigma, seed, chunk, nested",
+        "generations, patience, sigma, seed, chunk, refine, nested",
     ]
 
 
