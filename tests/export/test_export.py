@@ -249,7 +249,7 @@ def cheat(content):
 
 
 def heavier(content):
-    content["claim"]["parameters"]["m"] = (6.0).hex()
+    content["claim"]["parameters"]["m"] = [(6.0).hex()] * 2
     return resealed(content)
 
 
