@@ -1,0 +1,134 @@
+"""What predicts robustness? Rank correlations of random candidates' numbers with what they bear in simulation.
+
+Candidates are uniform in the unit box of the search. Of those with a funnel: the volumes and the push margin, nominal
+and under the configuration's `uncertainty` (zero where there is no funnel), the least volume of a knot, the input that
+the feed-forward leaves, and DIRTREL's l_w (Manchester, Kuindersma, RSS 2017), beside what `rtcd disturb` sees of them.
+"""
+
+import argparse
+import dataclasses
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from measure import RESULTS, environment, save
+
+from rtcd_jax.system.devices import prepare_jax
+
+CONFIG = Path(__file__).parents[2] / "configs" / "pendulum_robust.yaml"
+TARGETS = "largest push", "pushes recovered", "score", "model", "delay", "torque noise", "perturbation", "friction"
+
+
+def evaluated(config: Path, count: int, seed: int) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+    """Elites by their numbers, of the candidates with a nominal funnel, and their indicators [E] by name."""
+    import jax
+    import jax.numpy as jnp
+
+    from rtcd_jax.config.load import load
+    from rtcd_jax.elite.elite import Elite
+    from rtcd_jax.evaluation import make_evaluate
+    from rtcd_jax.problem import make_problem
+    from rtcd_jax.run.format import arrays_of, record_of
+    from rtcd_jax.system.files import plain
+    from rtcd_jax.types import Status
+    from rtcd_jax.volume import VOLUMES
+
+    robust = make_problem(load(config))
+    nominal = dataclasses.replace(robust, uncertainty=None)
+    genomes = jnp.asarray(np.random.default_rng(seed).random((count, len(robust.free))))
+    host = {
+        name: jax.device_get(jax.jit(make_evaluate(problem))(genomes, jax.random.key(seed)))
+        for name, problem in (("nominal", nominal), ("robust", robust))
+    }
+    rows = np.flatnonzero(host["nominal"].status == Status.OK)
+    elites, indicators = {}, {f"{kind} {name}": [] for kind in host for name in VOLUMES}
+    indicators |= {name: [] for name in ("least volume of a knot", "spare input", "- DIRTREL's l_w")}
+    for row in rows:
+        one = jax.tree.map(lambda leaf, row=row: leaf[row], host["nominal"])
+        elite = Elite.of(arrays_of(nominal, one), plain(record_of(nominal, one)))
+        elites[str(row)] = elite
+        for kind, evaluation in host.items():
+            for name in VOLUMES:
+                indicators[f"{kind} {name}"].append(evaluation.volumes[name][row])
+        indicators["least volume of a knot"].append(elite.volumes_per_knot.min())
+        indicators["spare input"].append(1 - np.mean(np.abs(elite.u) / elite.u_max))
+        indicators["- DIRTREL's l_w"].append(-dirtrel(elite))
+    return elites, {name: np.array(values) for name, values in indicators.items()}
+
+
+def dirtrel(elite: Any) -> float:
+    """l_w = sum_k tr((Q + K_k'R K_k) E_k), E_k+1 = A_k E_k A_k' + G_k G_k', from E_0 = 0 and unit disturbances of u."""
+    from scipy.linalg import expm
+
+    from rtcd_jax.elite.funnel import linearized
+    from rtcd_jax.elite.simulators import dynamics_of
+
+    n, m, dt = elite.x_goal.size, elite.u_max.size, elite.time[1]
+    a, b = linearized(dynamics_of(elite), elite.x[:-1], elite.u)
+    spread, total = np.zeros((n, n)), 0.0
+    for a_k, b_k, k in zip(a, b, elite.K[:-1], strict=True):
+        flow = expm(dt * np.block([[a_k - b_k @ k, b_k], [np.zeros((m, n + m))]]))
+        spread = flow[:n, :n] @ spread @ flow[:n, :n].T + flow[:n, n:] @ flow[:n, n:].T
+        total += np.trace((elite.Q + k.T @ elite.R @ k) @ spread)
+    return float(total)
+
+
+def simulated(elites: Mapping[str, Any], seed: int) -> dict[str, np.ndarray]:
+    """What `rtcd disturb` sees of them [E], by `TARGETS`."""
+    from rtcd_jax.analysis.disturb.comparison import Meter, comparison_of, run
+    from rtcd_jax.analysis.disturb.experiments import impulse, robustness
+    from rtcd_jax.system.console import Console
+
+    comparison = comparison_of(dict(elites), None)
+    meter = Meter(Console(), 3000 * len(elites))
+
+    def simulate(rollouts, experiment, settles):
+        return run(comparison, rollouts, seed, experiment, meter, settles)
+
+    pushes, robust = impulse(comparison, simulate)["summary"], robustness(comparison, seed, simulate)["summary"]
+    found = {
+        "largest push": [pushes[name]["largest_at_all_times"] for name in elites],
+        "pushes recovered": [pushes[name]["recovered"] for name in elites],
+    }
+    found |= {target: [robust[name][target] for name in elites] for target in TARGETS[2:]}
+    return {name: np.array(values) for name, values in found.items()}
+
+
+def correlations(indicators: Mapping[str, np.ndarray], targets: Mapping[str, np.ndarray]) -> Iterator[dict[str, Any]]:
+    """Spearman's, an indicator a row; None where one of the two is constant."""
+    from scipy.stats import spearmanr
+
+    for name, values in indicators.items():
+        pairs = {target: (values, truth) for target, truth in targets.items()}
+        constant = {target for target, pair in pairs.items() if any(np.ptp(each) == 0 for each in pair)}
+        row = {t: None if t in constant else float(spearmanr(*pair).statistic) for t, pair in pairs.items()}
+        yield {"indicator": name, **row}
+
+
+def shown(correlation: float | None) -> str:
+    return "-" if correlation is None else f"{correlation:.2f}"
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--config", type=Path, default=CONFIG, help="its box, and its uncertainty")
+    parser.add_argument("--candidates", type=int, default=48)
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--results", type=Path, default=RESULTS, help="folder of the JSON file")
+    arguments = parser.parse_args()
+    prepare_jax(1)
+    elites, indicators = evaluated(arguments.config, arguments.candidates, arguments.seed)
+    borne = int(np.sum(indicators["robust sum"] > 0))
+    print(f"{len(elites)} of {arguments.candidates} candidates have a funnel, {borne} under the uncertainty")
+    rows = list(correlations(indicators, simulated(elites, arguments.seed)))
+    print(f"{'rank correlation with':26}" + "".join(f"{target:>17}" for target in TARGETS))
+    for row in rows:
+        print(f"{row['indicator']:26}" + "".join(f"{shown(row[target]):>17}" for target in TARGETS))
+    record = {"environment": environment("jax", "numpy"), "config": arguments.config.name, "candidates": len(elites)}
+    record |= {"under_uncertainty": borne, "rows": rows}
+    print(save(f"robustness_{arguments.config.stem}.json", record, arguments.results))
+
+
+if __name__ == "__main__":
+    main()
