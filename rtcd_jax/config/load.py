@@ -49,8 +49,14 @@ weights:
 """The shortest complete YAML: the paper's pendulum with the default settings."""
 
 SMALLEST_DESIGN, SMALLEST_WEIGHT = 1e-6, 1e-9
-LATER_KEYS = ("refine", "patience")
-"""Of `search`, whose defaults leave the hashes of configurations as they were before there were such keys."""
+LATER_KEYS = (
+    ("uncertainty",),
+    ("search", "at_least"),
+    ("search", "refine"),
+    ("search", "patience"),
+    ("trajectory", "input_share"),
+)
+"""At their defaults they leave the hashes of configurations as they were before there were such keys."""
 
 
 class Config(Settings):
@@ -253,15 +259,10 @@ def load(path: Path) -> Config:
     if isinstance(data, Mapping) and "sweep" in data:
         problem = Problem(("sweep",), f"makes several runs of this file: they are started by `rtcd sweep {path}`")
         raise ConfigError([problem], str(path))
-    return parse(with_mjcf(data, path), str(path))
+    return parse(data, str(path))
 
 
-def with_mjcf(data: Any, path: Path) -> Any:
-    """What a YAML file holds, with the text of the MJCF that its plant names, which lies beside the file.
-
-    Raises:
-        ConfigError: the MJCF cannot be read.
-    """
+def _with_mjcf(data: Any, path: Path) -> Any:
     plant = data.get("plant") if isinstance(data, Mapping) else None
     if not isinstance(plant, Mapping) or not isinstance(plant.get("mjcf"), str) or "xml" in plant:
         return data
@@ -280,22 +281,31 @@ def parse_uncertainty(data: Any, source: str) -> UncertaintyConfig:
 
 
 def load_uncertainty(path: Path) -> UncertaintyConfig:
-    """The `uncertainty` section of a YAML file, or a file of its keys alone; `ConfigError` as `load`."""
+    """The `uncertainty` that a YAML file states; `ConfigError` as `load`."""
+    return parse_uncertainty(read_uncertainty(path), str(path))
+
+
+def read_uncertainty(path: Path) -> Any:
+    """The `uncertainty` section of a YAML file, or a file of its keys alone, as it stands there."""
     data = read_yaml(path)
     if isinstance(data, Mapping) and "uncertainty" in data:
         data = data["uncertainty"]
-    return parse_uncertainty({} if data is None else data, str(path))
+    return {} if data is None else data
 
 
 def read_yaml(path: Path) -> Any:
-    """What a YAML file holds, as it stands there; `ConfigError` if there is no such file, or no YAML in it."""
+    """What a YAML file holds, with the text of the MJCF that its plant names, which lies beside it.
+
+    Raises:
+        ConfigError: there is no such file, no YAML in it, or no such MJCF.
+    """
     if not path.is_file():
         folder, what = (path, "is a folder") if path.is_dir() else (path.parent, "no such file")
         there = sorted(str(other) for other in folder.glob("*.y*ml"))
         advice = closest(path, there) if there else f"{folder} has no YAML file"
         raise ConfigError([Problem((), f"{what}; {advice}")], str(path))
     with path.open("rb") as file:
-        return _plain_yaml(file.read(yaml12.LARGEST_FILE + 1), str(path))
+        return _with_mjcf(_plain_yaml(file.read(yaml12.LARGEST_FILE + 1), str(path)), path)
 
 
 def resolved(config: Config) -> dict[str, Any]:
@@ -322,15 +332,12 @@ _Dumper.add_representer(str, _text)
 def config_hash(config: Config) -> str:
     """Twelve hexadecimal digits of the SHA-256 of the canonical JSON: equal exactly for equal configurations."""
     stated = resolved(config)
-    if config.uncertainty == UncertaintyConfig():
-        del stated["uncertainty"]  # as before there was such a section
-    if not config.search.at_least:
-        del stated["search"]["at_least"]
-    if config.trajectory.input_share == 1:
-        del stated["trajectory"]["input_share"]
-    for key in LATER_KEYS:
-        if getattr(config.search, key) == SearchConfig.model_fields[key].default:
-            del stated["search"][key]
+    for *sections, key in LATER_KEYS:
+        part, place = config, stated
+        for section in sections:
+            part, place = getattr(part, section), place[section]
+        if getattr(part, key) == type(part).model_fields[key].default:
+            del place[key]
     canonical = json.dumps(stated, sort_keys=True, separators=(",", ":"))
     return hashlib.sha256(canonical.encode()).hexdigest()[:12]
 

@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import NamedTuple
 from xml.etree import ElementTree as Xml
 
-LARGEST_FILE = 2**20
-"""Bytes."""
+LARGEST_FILE = 2**17
+"""Bytes: a run's config.yaml, which has the text in it, must be small enough to be read."""
 ELSEWHERE = ("include", "replicate", "attach", "composite", "flexcomp", "plugin", "extension")
 """Elements that put into a model what its text does not name."""
 

@@ -10,7 +10,6 @@ the policy clips its inputs itself.
 import copy
 from collections.abc import Iterator, Mapping
 from functools import cache
-from typing import Any
 
 import mujoco
 import numpy as np
@@ -51,14 +50,14 @@ def compiled(xml: str) -> mujoco.MjModel:
     return _as_simulated(model)
 
 
-def with_numbers(robot: Robot, values: Mapping[str, Any] | None = None) -> mujoco.MjModel:
-    """The compiled model with what `set` says in it: all of it, or its numbers alone where there are no `values`."""
+def with_numbers(robot: Robot) -> mujoco.MjModel:
+    """The compiled model with the numbers that `set` says in it, and what it says in arithmetic as it was."""
     model = copy.copy(compiled(robot.xml))
     for edit in robot.edits:
         row = _leaf(model, edit.kind, edit.attribute, edit.object)
         for i, value in enumerate(edit.values):
-            if values is not None or not isinstance(value, str):
-                row[i] = value_of(value, values or {})
+            if not isinstance(value, str):
+                row[i] = value
     return model
 
 

@@ -46,19 +46,23 @@ def arrays_of(problem: Problem, evaluation: Evaluation) -> dict[str, np.ndarray]
     }
 
 
+def policy_of(arrays: Mapping[str, Any], record: Mapping[str, Any]) -> Policy:
+    """The policy that `arrays_of` and `record_of` stored, of a candidate that has a funnel."""
+    ok: Any = np.int32(Status.OK)
+    told = record.get("trajectory", {})
+    numbers: dict[str, Any] = {name: np.asarray(told.get(name, 0)) for name in ("cost", "defect", "iterations")}
+    motion = Trajectory(arrays["u"], arrays["x"], arrays["time"][1] - arrays["time"][0], **numbers, status=ok)
+    return Policy(motion, arrays["K"], arrays["S"], ok, arrays.get("S_rates"))
+
+
 def evaluation_of(problem: Problem, arrays: Mapping[str, Any], record: Mapping[str, Any]) -> Evaluation:
     """The evaluation that `arrays_of` and `record_of` stored, of a candidate that has a funnel."""
     ok: Any = np.int32(Status.OK)
-    trajectory: dict[str, Any] = {
-        name: np.asarray(record["trajectory"][name]) for name in ("cost", "defect", "iterations")
-    }
-    path = arrays["u"], arrays["x"], arrays["time"][1]
-    motion = Trajectory(*path, **trajectory, status=ok)
-    policy = Policy(motion, arrays["K"], arrays["S"], ok, arrays.get("S_rates"))
+    policy = policy_of(arrays, record)
     borne = None if problem.uncertainty is None else jnp.ones(())
     funnel = Funnel(policy, arrays["rho"], arrays["trials"], ok, borne)
     candidate = jax.device_get(decode(problem, jnp.asarray(arrays["genome"])))
-    volumes = jax.device_get(funnel_volume(funnel, input_jumps(problem, candidate, motion)))
+    volumes = jax.device_get(funnel_volume(funnel, input_jumps(problem, candidate, policy.trajectory)))
     return Evaluation(arrays["genome"], candidate, funnel, volumes, ok)
 
 

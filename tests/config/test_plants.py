@@ -5,8 +5,9 @@ import pytest
 
 from rtcd_jax.config import yaml12
 from rtcd_jax.config.load import config_hash, dump, load, parse, parse_yaml
-from rtcd_jax.config.mjcf import NotMjcf, read_names
+from rtcd_jax.config.mjcf import LARGEST_FILE, NotMjcf, read_names
 from rtcd_jax.config.plants import PLANTS, stored_plant
+from rtcd_jax.run.sweep import read_cases
 from rtcd_jax.system.errors import ConfigError, UserError
 
 XML = PLANTS["acrobot"].xml
@@ -188,3 +189,21 @@ def test_a_class_outside_the_package_is_a_robot(tmp_path, monkeypatch):
     ):
         with pytest.raises(ConfigError, match=words):
             parse(data | {"plant": {"python": python}})
+
+
+def test_a_sweep_of_a_robot_reads_its_mjcf(written, tmp_path):
+    config = written()
+    text = (tmp_path / "robot.yaml").read_text() + "sweep: {product: {design.lower_mass.initial: [0.5, 0.6]}}\n"
+    (tmp_path / "sweep.yaml").write_text(text)
+    cases = read_cases(tmp_path / "sweep.yaml", tmp_path / "runs")
+    assert [case.config.design["lower_mass"].initial for case in cases] == [0.5, 0.6]
+    assert cases[1].config == config
+
+
+def test_the_largest_mjcf_makes_a_configuration_that_can_be_read(written):
+    """Also where YAML must quote it."""
+    comment = "x\t" * ((LARGEST_FILE - len(XML) - len("<!---->")) // 2)
+    config = written(xml=[("</mujoco>\n", f"</mujoco>\n<!--{comment}-->")])
+    assert parse_yaml(dump(config)) == config
+    with pytest.raises(ConfigError, match=r"plant.mjcf = 'robot.xml': has more than 131072 bytes"):
+        written(xml=[("</mujoco>\n", f"</mujoco>\n<!--{'x' * LARGEST_FILE}-->")])

@@ -9,7 +9,7 @@ from typing import Any, final
 import jax
 import jax.numpy as jnp
 
-from rtcd_jax.config.load import Config, parse, read_yaml, resolved
+from rtcd_jax.config.load import Config, parse, read_uncertainty, resolved
 from rtcd_jax.problem import Problem
 from rtcd_jax.system.errors import UserError
 from rtcd_jax.types import Uncertainty
@@ -44,8 +44,7 @@ def with_box(config: Config, file: Path | None) -> Config:
     data = resolved(config)
     data["funnel"]["rollouts"] = "closed_form"
     if file is not None:
-        given = read_yaml(file)
-        data["uncertainty"] = given.get("uncertainty", given) if isinstance(given, dict) else given
+        data["uncertainty"] = read_uncertainty(file)
     changed = parse(data, str(file or "configuration"))
     if changed.uncertainty.empty:
         where = f"{file} states" if file else "the run states"

@@ -21,9 +21,10 @@ from rtcd_jax.funnel import estimate_funnel
 from rtcd_jax.plants import plant_of
 from rtcd_jax.policy import input_jumps
 from rtcd_jax.problem import Problem, make_problem
+from rtcd_jax.run.format import policy_of
 from rtcd_jax.system.console import Clock, Console, Progress, duration, table
 from rtcd_jax.system.files import make_folder, replace, replace_json
-from rtcd_jax.types import Candidate, Policy, Status, Trajectory, Uncertainty
+from rtcd_jax.types import Candidate, Status, Uncertainty
 from rtcd_jax.volume import VOLUMES, funnel_volume
 
 PRECISE = 1.01
@@ -112,7 +113,8 @@ def _teller(boxes: Sequence[Side], console: Console) -> Callable[[np.ndarray, np
 
 def _program(problem: Problem, elite: Elite) -> Callable[[Uncertainty], tuple[Array, dict[str, Array]]]:
     """Of boxes [B]: whether the elite's policy has a funnel under each, and its volumes there."""
-    candidate, policy = _policy(problem, elite)
+    candidate = _candidate(problem, elite)
+    policy = jax.tree.map(jnp.asarray, policy_of(vars(elite), elite.record))
     jumps = input_jumps(problem, candidate, policy.trajectory)
     directions = {"directions": problem.config.elites.directions}
 
@@ -126,15 +128,11 @@ def _program(problem: Problem, elite: Elite) -> Callable[[Uncertainty], tuple[Ar
     return jax.jit(jax.vmap(under))
 
 
-def _policy(problem: Problem, elite: Elite) -> tuple[Candidate, Policy]:
-    """The stored candidate and its policy, as a run has them."""
+def _candidate(problem: Problem, elite: Elite) -> Candidate:
+    """The stored candidate, as a run has it."""
     _, design = plant_of(elite.robot, elite.parameters, elite.design_units)
     searched = {name: jnp.asarray(elite.policy[name], float) for name in problem.config.policy.variables()}
-    candidate = Candidate(design, jnp.diag(jnp.asarray(elite.Q)), jnp.diag(jnp.asarray(elite.R)), searched)
-    zero, none = jnp.zeros(()), jnp.zeros((), jnp.int32)
-    us, xs, dt = jnp.asarray(elite.u), jnp.asarray(elite.x), jnp.asarray(elite.time[1] - elite.time[0])
-    trajectory = Trajectory(us, xs, dt, cost=zero, defect=zero, iterations=none, status=none)
-    return candidate, Policy(trajectory, jnp.asarray(elite.K), jnp.asarray(elite.S), none)
+    return Candidate(design, jnp.diag(jnp.asarray(elite.Q)), jnp.diag(jnp.asarray(elite.R)), searched)
 
 
 def _rows(boxes: Sequence[Side], factors: np.ndarray, volumes: dict[str, np.ndarray]) -> list[dict[str, Any]]:
