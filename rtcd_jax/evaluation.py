@@ -9,7 +9,8 @@ from functools import partial
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int, PRNGKeyArray
+import numpy as np
+from jaxtyping import Array, Float, Int, PRNGKeyArray, PyTree
 
 from rtcd_jax import rollout
 from rtcd_jax.adversary import Worst
@@ -21,7 +22,7 @@ from rtcd_jax.policy import input_jumps, stabilize
 from rtcd_jax.problem import Problem
 from rtcd_jax.system.devices import path_batch
 from rtcd_jax.trajectory import plan
-from rtcd_jax.types import Candidate, Evaluation, Policy, Trajectory
+from rtcd_jax.types import Candidate, Evaluation, Policy
 from rtcd_jax.validation import Dynamics, PhysicsComparison, Rollouts, SamplingBudget, compare_physics
 from rtcd_jax.volume import funnel_volume
 
@@ -80,12 +81,14 @@ def make_evaluate(problem: Problem, budget: SamplingBudget | None = None) -> Eva
     def evaluate(genomes: Float[Array, "P d"], key: PRNGKeyArray) -> Evaluation:
         candidates = jax.vmap(partial(decode, problem))(genomes)
         trajectories = plan(problem, candidates)
-        assess = partial(_assess, problem, budget, key)
         count = genomes.shape[0]
         batch = count if on_gpu() else batch_in_cache(problem, count)
-        padded = jax.tree.map(lambda leaf: _padded(leaf, -count % batch), (genomes, candidates, trajectories))
-        evaluation = jax.lax.map(assess, padded, batch_size=batch)
-        return jax.tree.map(lambda leaf: leaf[:count], evaluation)
+        policies = in_batches(lambda pair: stabilize(problem, *pair), (candidates, trajectories), batch)
+        # A batch takes the steps that its stiffest candidate needs.
+        stiffness = jax.vmap(lambda *pair: rollout.stiffness(problem, pair[0], pair[1], budget.funnel))
+        order = jnp.argsort(stiffness(candidates, policies).parts)
+        assess = lambda one: _with_funnel(problem, budget, key, *one)  # noqa: E731
+        return in_batches(assess, (genomes, candidates, policies), batch, order)
 
     return evaluate
 
@@ -118,8 +121,18 @@ def _bytes_of_states(problem: Problem) -> int:
     return 8 * problem.config.trajectory.knots * problem.plant.n * problem.config.funnel.trials
 
 
-def _padded(leaf, count: int):
-    return jnp.concatenate([leaf, jnp.repeat(leaf[-1:], count, axis=0)]) if count else leaf
+def in_batches(f: Callable, xs: PyTree, batch: int, order: Int[Array | np.ndarray, " P"] | None = None) -> PyTree:
+    """f of every candidate, `batch` of them at once, in the `order` given; the last batch is filled up."""
+    count = jax.tree.leaves(xs)[0].shape[0]
+    if batch == count:
+        return jax.lax.map(f, xs, batch_size=batch)
+    order = np.arange(count) if order is None else order
+    filled = order[np.minimum(np.arange(count + -count % batch), count - 1)]
+    return _take(jax.lax.map(f, _take(xs, filled), batch_size=batch), jnp.argsort(order))
+
+
+def _take(tree: PyTree, rows: Int[Array | np.ndarray, " E"]) -> PyTree:
+    return jax.tree.map(lambda leaf: leaf[rows], tree)
 
 
 def resample(
@@ -139,17 +152,6 @@ def compare_with_mjx(problem: Problem, evaluation: Evaluation, key: PRNGKeyArray
     funnel, config = evaluation.funnel, problem.config
     rollouts = Rollouts.of(problem, evaluation.candidate, funnel.policy, config.funnel)
     return compare_physics(rollouts, funnel.levels, key, config.elites.mjx_states)
-
-
-def _assess(
-    problem: Problem,
-    budget: SamplingBudget,
-    key: PRNGKeyArray,
-    planned: tuple[Float[Array, " d"], Candidate, Trajectory],
-) -> Evaluation:
-    genome, candidate, trajectory = planned
-    policy = stabilize(problem, candidate, trajectory)
-    return _with_funnel(problem, budget, key, genome, candidate, policy)
 
 
 def _with_funnel(

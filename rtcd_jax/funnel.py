@@ -57,7 +57,8 @@ def estimate_funnel(
     `trials[k]` held-out samples, independent and uniform in the final B_k, were rolled out without a failure: over
     their interval or, with `budget.samples_per_knot`, to the goal. It is zero where the last round had failures.
     `samples_per_knot`, a number or a tracer, stands in for the budget's unless that is 0.
-    Status: FUNNEL_EMPTY if some level is below the smallest one that counts.
+    Status: FUNNEL_EMPTY if some level is below the smallest one that counts; TOO_STIFF where the rollouts' steps are
+    unstable for the closed loop, so that nothing can be said.
     """
     keys = jax.random.split(key, 4)
     rollouts = Rollouts.of(problem, candidate, policy, budget.funnel)
@@ -65,7 +66,7 @@ def estimate_funnel(
     boxes = sets.radii_inside(jnp.asarray(problem.state_limits, sets.centers.dtype))
     saturated = _saturating_radius(problem, policy, sets.part(slice(-1, None)))
     boxes = jnp.minimum(boxes, REACH * saturated)
-    last = goal_level(problem, candidate, policy, sets.part(slice(-1, None)), boxes[-1], keys[0], budget)
+    last = goal_level(rollouts, boxes[-1], keys[0], budget)
 
     levels = knot_levels(rollouts, boxes, last, keys[1], budget)
     levels, samples = validate_intervals(rollouts, levels, keys[2], budget)
@@ -74,10 +75,11 @@ def estimate_funnel(
     filled = (levels >= (jnp.minimum(boxes, saturated) * SMALLEST) ** 2) & (boxes > 0)
     full = jnp.all(filled)
     finite = jnp.all(jnp.isfinite(levels)) & jnp.all(jnp.isfinite(policy.values))
+    empty = jnp.where(rollouts.stiffness.too_stiff, Status.TOO_STIFF, Status.FUNNEL_EMPTY)
     status = first_failure(
         policy.status,
         jnp.where(finite, Status.OK, Status.NOT_FINITE),
-        jnp.where(full, Status.OK, Status.FUNNEL_EMPTY),
+        jnp.where(full, Status.OK, empty),
     )
     uncertain = budget.dynamics.directions.opponent is not None
     borne = jnp.mean(jnp.cumprod(filled[::-1]).astype(levels.dtype)) if uncertain else None
@@ -168,10 +170,7 @@ def _saturating_radius(problem, policy, goal_set: Ellipsoids):
 
 
 def goal_level(
-    problem: Problem,
-    candidate: Candidate,
-    policy: Policy,
-    goal_set: Ellipsoids,
+    rollouts: Rollouts,
     box: Float[Array, ""],
     key: PRNGKeyArray,
     budget: SamplingBudget,
@@ -181,14 +180,15 @@ def goal_level(
     V then decreases at all multiples of the horizon, so that every state arrives: a Lyapunov function of the map over
     the horizon, which for a long one reaches out to the ellipsoid's whole region of attraction.
     """
-    goal, lqr, dynamics = budget.funnel.goal, (policy.gains[-1], policy.values[-1]), budget.dynamics.directions
+    goal, dynamics = rollouts.goal, budget.dynamics.directions
+    goal_set = rollouts.sets.part(slice(-1, None))
 
     def growth(radii, key):
         """The `radii` along directions [D J], and what becomes of V and the boxes there: bad if > 1."""
-        directions = sampling.directions(key, goal.directions, problem.plant.n, box.dtype)
+        directions = sampling.directions(key, goal.directions, rollouts.problem.plant.n, box.dtype)
         grid = jnp.broadcast_to(radii, (goal.directions, len(radii)))
         x = goal_set.points(grid[None], directions[:, None, :, None])
-        ends, peaks = rollout.roll_at_goal(problem, candidate, lqr, x, dynamics, goal.horizon, goal.step)
+        ends, peaks = rollouts.at_goal(x, dynamics)
         return grid, jnp.maximum(goal_set.level(ends) / grid**2, peaks**2)[0]
 
     def narrow(bracket, key):

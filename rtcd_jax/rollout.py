@@ -13,15 +13,20 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from rtcd_jax.adversary import Drawn, Opponent, Situation
-from rtcd_jax.numerics.integrate import END, MIDDLE, START, rk4_varying_step, split
+from rtcd_jax.config.schema import FunnelConfig
+from rtcd_jax.numerics.batched import mm, spectral_radius
+from rtcd_jax.numerics.integrate import END, MIDDLE, STABLE, START, rk4_varying_step, split
 from rtcd_jax.numerics.loops import short_scan
 from rtcd_jax.plants.base import Plant
-from rtcd_jax.policy import nominal
+from rtcd_jax.policy import linearize, nominal
 from rtcd_jax.problem import Problem
 from rtcd_jax.types import Candidate, Policy
+
+MOST_PARTS = 16
+"""Into so many a step about the goal is divided at most."""
 
 
 class Dynamics(NamedTuple):
@@ -153,10 +158,11 @@ def roll_at_goal(
     dynamics: Dynamics,
     duration: float,
     step: float,
+    parts: Int[Array, ""] | int = 1,
 ) -> tuple[Float[Array, "n *batch"], Float[Array, "*batch"]]:
     """End states after `duration` [s] under the goal's LQR, and the largest |x_i| / limit_i till then.
 
-    `goal_lqr` are its gain and its value matrix.
+    `goal_lqr` are its gain and its value matrix. Each `step` [s] is taken in equal `parts`.
     """
     limits, bounds = problem.state_limits, _column(problem.input_limits, x)
     gain, cost = (_align(part, x.ndim - 1) for part in goal_lqr)
@@ -168,12 +174,36 @@ def roll_at_goal(
 
     def advance(_, carry):
         x, peak = carry
-        x = _step(slope, x, step, dynamics.large)
+        x = _step(slope, x, dt, dynamics.large)
         return x, jnp.maximum(peak, _fill(x, limits))
 
+    def over_the_steps(_, carry):  # a loop of a fixed length: under vmap one of a traced length masks every turn
+        return jax.lax.fori_loop(0, round(duration / step), advance, carry)
+
+    dt = jnp.asarray(step / parts, x.dtype)
     start = split(x)
-    ends, peak = jax.lax.fori_loop(0, round(duration / step), advance, (start, _fill(start, limits)))
+    ends, peak = jax.lax.fori_loop(0, parts, over_the_steps, (start, _fill(start, limits)))
     return jnp.stack(ends), peak
+
+
+class Stiffness(NamedTuple):
+    """`parts` into which a step about the goal has to be divided, for the integrator to be stable for the closed loop's
+    fastest mode; `too_stiff`: it is not in `MOST_PARTS` parts, or not in the steps along the motion.
+    """
+
+    parts: Int[Array, ""]
+    too_stiff: Bool[Array, ""]
+
+
+def stiffness(problem: Problem, candidate: Candidate, policy: Policy, funnel: FunnelConfig) -> Stiffness:
+    """How fast the loop is for the steps of its rollouts; where it is too fast, or not finite, one part has to do."""
+    inputs = jnp.pad(policy.trajectory.us.T, ((0, 0), (0, 1)))
+    a, b = linearize(problem, candidate, policy.trajectory.xs.T, inputs)
+    fastest = spectral_radius(a - mm(b, jnp.moveaxis(policy.gains, 0, -1)))
+    parts = jnp.ceil(fastest[-1] * funnel.goal.step / STABLE)
+    along = jnp.max(fastest) * policy.trajectory.dt / funnel.steps
+    too_stiff = (parts > MOST_PARTS) | (along > STABLE)
+    return Stiffness(jnp.where((parts > 1) & ~too_stiff, parts, 1).astype(int), too_stiff)
 
 
 def _rate(dynamics: Dynamics, candidate: Candidate, at: Situation):

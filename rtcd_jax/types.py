@@ -25,6 +25,7 @@ class Status(enum.IntEnum):
     RICCATI_INDEFINITE = 2
     FUNNEL_EMPTY = 3
     NOT_FINITE = 4
+    TOO_STIFF = 5
 
     @property
     def message(self) -> str:
@@ -37,6 +38,7 @@ _MESSAGES = {
     Status.RICCATI_INDEFINITE: "the Riccati equation has no positive definite solution along the trajectory",
     Status.FUNNEL_EMPTY: "a knot's level fell below the smallest sampled level: some knot has no funnel",
     Status.NOT_FINITE: "a number of the candidate's evaluation is not finite",
+    Status.TOO_STIFF: "the closed loop is too fast for the rollouts' steps: raise funnel.steps, lower funnel.goal.step",
 }
 
 

@@ -65,13 +65,15 @@ class Rollouts(NamedTuple):
     policy: Policy
     sets: Ellipsoids
     tracking: rollout.TrackingData
+    stiffness: rollout.Stiffness
     goal: GoalConfig
 
     @classmethod
     def of(cls, problem: Problem, candidate: Candidate, policy: Policy, funnel: FunnelConfig) -> "Rollouts":
         sets = Ellipsoids.about(policy.trajectory.xs.T, jnp.moveaxis(policy.values, 0, -1))
         tracking = rollout.tracking_data(problem, candidate, policy, funnel.steps)
-        return cls(problem, candidate, policy, sets, tracking, funnel.goal)
+        stiffness = rollout.stiffness(problem, candidate, policy, funnel)
+        return cls(problem, candidate, policy, sets, tracking, stiffness, funnel.goal)
 
     @property
     def intervals(self) -> int:
@@ -82,6 +84,13 @@ class Rollouts(NamedTuple):
     ) -> tuple[Float[Array, "n intervals *batch"], Float[Array, "intervals *batch"]]:
         """End states and peaks after one interval each."""
         return rollout.roll_intervals(self.problem, self.candidate, tracking, x, dynamics)
+
+    def at_goal(
+        self, x: Float[Array, "n *batch"], dynamics: rollout.Dynamics
+    ) -> tuple[Float[Array, "n *batch"], Float[Array, "*batch"]]:
+        """End states and peaks after the horizon under the goal's LQR."""
+        lqr, timing = (self.policy.gains[-1], self.policy.values[-1]), (self.goal.horizon, self.goal.step)
+        return rollout.roll_at_goal(self.problem, self.candidate, lqr, x, dynamics, *timing, self.stiffness.parts)
 
     def interval(
         self, x: Float[Array, "n S"], k: Int[Array, ""], dynamics: rollout.Dynamics
@@ -97,8 +106,7 @@ class Rollouts(NamedTuple):
 
         Against an opponent it is enough that they stay in the residual set of the region of level `last`.
         """
-        goal, lqr = self.goal, (self.policy.gains[-1], self.policy.values[-1])
-        ends, peaks = rollout.roll_at_goal(self.problem, self.candidate, lqr, x, dynamics, goal.horizon, goal.step)
+        ends, peaks = self.at_goal(x, dynamics)
         before, after = self.level(x, self.intervals), self.level(ends, self.intervals)
         closer = after < before
         if dynamics.opponent is not None:

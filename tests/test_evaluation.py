@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from rtcd_jax.evaluation import make_evaluate, resample, search_budget
+from rtcd_jax.evaluation import in_batches, make_evaluate, resample, search_budget
 from rtcd_jax.funnel import MARGIN
 from rtcd_jax.genome import decode
 from rtcd_jax.numerics.ellipsoid import Ellipsoids
@@ -75,6 +75,13 @@ def test_neighbors_do_not_matter():
     assert same(*(jax.tree.map(lambda leaf: leaf[others], e) for e in (broken, pipeline.evaluated())))
     assert broken.status[2] == Status.TRAJECTORY_NOT_SOLVED
     assert broken.volumes["sum"][2] == 0
+
+
+@pytest.mark.parametrize("batch", [1, 3, 7, 8])
+def test_batches_in_any_order_give_the_candidates_in_theirs(batch):
+    x = jnp.asarray(np.random.default_rng(0).normal(size=(7, 2)))
+    seen = in_batches(jnp.cumsum, x, min(batch, 7), order=jnp.array([5, 0, 6, 2, 1, 4, 3]))
+    np.testing.assert_array_equal(seen, np.cumsum(x, 1))
 
 
 @pytest.mark.slow

@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import scipy.linalg
 import yaml
 
 from rtcd_jax import rollout
@@ -200,6 +201,38 @@ def test_a_saturated_funnel_is_that_of_a_dense_grid():
     assert 0.6**2 < min(lowest) <= max(lowest) < 0.9**2
     np.testing.assert_allclose(funnel.levels, lowest[::-1], rtol=0.02)
     assert funnel.status == Status.OK
+
+
+@cache
+def _stiff():
+    return _estimator(linear.problem_of(BOX, intervals=4), rounds=3, samples_per_knot=64)
+
+
+def _cheap(r: float, dt: float):
+    """At rest under an LQR whose input costs `r`: its fastest mode is at r^-1/2 1/s."""
+    value = scipy.linalg.solve_continuous_are(linear.A, linear.B, linear.Q, [[r]])
+    gain = linear.B.T @ value / r
+    assert np.max(np.abs(np.linalg.eigvals(linear.A - linear.B @ gain))) == pytest.approx(r**-0.5, rel=0.01)
+    gains, values = (jnp.tile(leaf, (5, 1, 1)) for leaf in (gain, value))
+    return _with(linear.policy(np.zeros(4), dt), gains=gains, values=values)
+
+
+@pytest.mark.parametrize(("r", "dt"), [(1e-4, 0.1), (1e-5, 0.01), (1e-6, 0.01)])
+def test_a_stiff_linear_loop_has_its_whole_funnel(r, dt):
+    """V falls from every state, so that each ellipsoid fills the boxes, though 0.02 s are 2 to 20 time constants."""
+    funnel = _stiff()(_cheap(r, dt))
+    assert funnel.status == Status.OK
+    largest = np.min(BOX**2 / np.diag(np.linalg.inv(funnel.policy.values[0])))
+    np.testing.assert_allclose(funnel.levels, (1 - MARGIN) * largest, rtol=1e-9)
+    assert np.all(funnel.trials == 64)
+
+
+@pytest.mark.parametrize(("r", "dt"), [(1e-5, 0.1), (1e-7, 0.01), (1e-8, 1e-4), (1e-12, 1e-6), (1e-12, 1.0)])
+def test_a_loop_too_stiff_for_its_rollouts_is_not_called_empty(r, dt):
+    """Time constants that an eighth of an interval, a sixteenth of 0.02 s, or both have too many of."""
+    fastest = r**-0.5
+    assert max(fastest * dt / 8, fastest * 0.02 / rollout.MOST_PARTS) > 2.785
+    assert _stiff()(_cheap(r, dt)).status == Status.TOO_STIFF
 
 
 def test_a_motion_that_leaves_the_boxes_has_an_empty_funnel():

@@ -136,6 +136,19 @@ def test_without_gains_the_nominal_motion_is_a_solution():
     np.testing.assert_allclose(ends[:, :, 0], policy.trajectory.xs[1:].T, atol=1e-8)
 
 
+def test_a_step_in_parts_is_that_many_shorter_steps():
+    x = jnp.asarray(GOAL)[:, None] + jnp.asarray(SMALL).T
+
+    @jax.jit
+    def divided(parts):
+        lqr = jnp.asarray(GOAL_GAIN), jnp.eye(2)
+        return rollout.roll_at_goal(PROBLEM, CANDIDATE, lqr, x, CLOSED_FORM, 0.4, 0.04, parts)
+
+    for parts in (1, 2, 5):
+        for whole, part in zip(_rolled_at_goal(x, 0.4, 0.04 / parts), divided(parts), strict=True):
+            np.testing.assert_allclose(part, whole, rtol=1e-12)
+
+
 def test_the_goal_is_not_left():
     ends, peaks = _rolled_at_goal(jnp.asarray(GOAL)[:, None], 1.0, 0.02)
     np.testing.assert_allclose(ends[:, 0], GOAL, atol=1e-13)

@@ -61,9 +61,7 @@ def stages(config: Config, population: int) -> Iterator[Stage]:
 
     def goal(candidate, policy):
         rollouts, boxes = prepared(candidate, policy)
-        return funnel.goal_level(
-            problem, candidate, policy, rollouts.sets.part(slice(-1, None)), boxes[-1], key, budget
-        )
+        return funnel.goal_level(rollouts, boxes[-1], key, budget)
 
     def scan(candidate, policy, last):
         rollouts, boxes = prepared(candidate, policy)

@@ -266,7 +266,9 @@ class GoalConfig(Settings):
     horizon: float = Field(
         default=2.0, ge=1e-3, le=1e3, description="time over which a rollout must come closer to the goal [s]"
     )
-    step: float = Field(default=0.02, ge=1e-6, le=1e3, description="RK4 step of these rollouts [s]")
+    step: float = Field(
+        default=0.02, ge=1e-6, le=1e3, description="RK4 step of these rollouts, divided where the loop is fast [s]"
+    )
 
     def problems(self) -> Iterator[Problem]:
         if self.step >= self.horizon:

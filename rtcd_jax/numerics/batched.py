@@ -10,6 +10,8 @@ from typing import cast
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from rtcd_jax.numerics.loops import repeat
+
 
 def mm(a: Float[Array, "i k *#P"], b: Float[Array, "k j *#P"]) -> Float[Array, "i j *#P"]:
     """A B."""
@@ -77,6 +79,23 @@ def spd_solve(
     """A^-1 B for symmetric positive definite A; the flag is that of `cholesky`."""
     factor, positive = cholesky(a, floor)
     return solve_lower_transposed(factor, solve_lower(factor, b)), positive
+
+
+def spectral_radius(a: Float[Array, "n n *P"], squarings: int = 10) -> Float[Array, "*P"]:
+    """A bound of the largest |eigenvalue| from above, |A^k|^(1/k) with k = 2^squarings.
+
+    Gelfand's formula: it exceeds the eigenvalue at most by the k-th root of n times their basis' condition number.
+    """
+
+    def square(carry):
+        a, logarithm, share = carry
+        size = jnp.sqrt(jnp.sum(a**2, (0, 1)))
+        a = a / jnp.where(size > 0, size, 1)
+        return mm(a, a), logarithm + share * jnp.log(size), share / 2
+
+    start = a, jnp.zeros(a.shape[2:], a.dtype), jnp.ones((), a.dtype)
+    last, logarithm, share = repeat(squarings, square, start)
+    return jnp.exp(logarithm + share / 2 * jnp.log(jnp.sum(last**2, (0, 1))))
 
 
 def _sum(terms: Iterable[Array]) -> Array:

@@ -15,6 +15,9 @@ from rtcd_jax.numerics.loops import on_gpu, repeat
 START, MIDDLE, END = 0, 1, 2
 """Where in the step a slope is taken."""
 
+STABLE = 2.6
+"""Steps of x' = lambda x are stable for Re lambda < 0 and |lambda| dt up to this (2.785 where lambda is real)."""
+
 
 def split(x: Float[Array, "n *batch"]) -> tuple[Float[Array, "*batch"], ...]:
     """The components of x."""

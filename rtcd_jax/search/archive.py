@@ -80,7 +80,8 @@ def graded_cost(evaluation: Evaluated, search: SearchConfig) -> Float[Array, "*P
     costs = cost(evaluation, search)
     if evaluation.borne is None:
         return costs
-    return jnp.where(evaluation.status == Status.FUNNEL_EMPTY, FAILED * (2 - evaluation.borne), costs)
+    estimated = (evaluation.status == Status.FUNNEL_EMPTY) | (evaluation.status == Status.TOO_STIFF)
+    return jnp.where(estimated, FAILED * (2 - evaluation.borne), costs)
 
 
 def empty(capacity: int, example: Evaluation) -> Elites:

@@ -101,3 +101,18 @@ def test_single_precision_stays_single():
     a, b = positive_definite(3).astype(np.float32), random(3, 2).astype(np.float32)
     solution, _ = jax.jit(batched.spd_solve)(a, b)
     assert solution.dtype == jnp.float32
+
+
+@pytest.mark.parametrize("n", [1, 2, 4])
+def test_the_spectral_radius_is_bounded_from_above_and_closely(n):
+    """Of modes that are apart by 1e6, real and complex, in a basis that is not orthogonal."""
+    a = np.array(random(n, n, seed=n)) * np.logspace(-3, 3, n)[:, None, None]
+    exact = np.array([np.max(np.abs(np.linalg.eigvals(a[..., p]))) for p in range(BATCH)])
+    bound = np.asarray(batched.spectral_radius(jnp.asarray(a)))
+    assert np.all(bound >= exact * (1 - 1e-12))
+    np.testing.assert_allclose(bound, exact, rtol=0.1)
+
+
+def test_the_spectral_radius_of_a_rotation_is_its_rate():
+    turn = jnp.array([[0.0, 3.0], [-3.0, 0.0]])
+    assert float(batched.spectral_radius(turn)) == pytest.approx(3.0, rel=0.01)

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from rtcd_jax.numerics.integrate import join, rk4, rk4_step, split
+from rtcd_jax.numerics.integrate import STABLE, join, rk4, rk4_step, split
 from rtcd_jax.numerics.loops import compiled_for
 
 
@@ -64,3 +64,18 @@ def test_components_are_joined_as_they_were_split(platform):
     with compiled_for(platform):
         joined = jax.jit(lambda x: join(split(x)))(x)
     np.testing.assert_array_equal(joined, x)
+
+
+def test_steps_are_stable_on_the_left_half_disk_and_not_on_one_much_larger():
+    """x' = lambda x, x(dt) = x (1 + z + z^2/2 + z^3/6 + z^4/24) with z = lambda dt."""
+
+    def growth(radius, angles):
+        z = radius * np.exp(1j * angles)
+        real, imaginary = jnp.asarray(z.real), jnp.asarray(z.imag)
+        turn = lambda x, _: jnp.stack([real * x[0] - imaginary * x[1], imaginary * x[0] + real * x[1]])  # noqa: E731
+        return np.hypot(*rk4_step(turn, jnp.stack([jnp.ones(z.size), jnp.zeros(z.size)]), 0.0, 1.0))
+
+    left = np.linspace(np.pi / 2, np.pi, 1001)
+    assert np.all(growth(STABLE, left) <= 1)
+    assert np.max(growth(1.01 * STABLE, left)) > 1
+    assert growth(2.785, left[-1:]) < 1 < growth(2.786, left[-1:])
