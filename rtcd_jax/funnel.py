@@ -66,7 +66,7 @@ def estimate_funnel(
     boxes = sets.radii_inside(jnp.asarray(problem.state_limits, sets.centers.dtype))
     saturated = _saturating_radius(problem, policy, sets.part(slice(-1, None)))
     boxes = jnp.minimum(boxes, REACH * saturated)
-    last = goal_level(rollouts, boxes[-1], keys[0], budget)
+    last = goal_level(rollouts, boxes[-1], saturated, keys[0], budget)
 
     levels = knot_levels(rollouts, boxes, last, keys[1], budget)
     levels, samples = validate_intervals(rollouts, levels, keys[2], budget)
@@ -172,6 +172,7 @@ def _saturating_radius(problem, policy, goal_set: Ellipsoids):
 def goal_level(
     rollouts: Rollouts,
     box: Float[Array, ""],
+    saturated: Float[Array, ""],
     key: PRNGKeyArray,
     budget: SamplingBudget,
 ) -> Float[Array, ""]:
@@ -191,9 +192,9 @@ def goal_level(
         ends, peaks = rollouts.at_goal(x, dynamics)
         return grid, jnp.maximum(goal_set.level(ends) / grid**2, peaks**2)[0]
 
-    def narrow(bracket, key):
+    def narrow(bracket, turn):
         """Of a ladder of radii over the bracket, the last good one and the one above it, and the crossing between."""
-        low, high, _ = bracket
+        (low, high, _), (key, first) = bracket, turn
         ladder = low * (high / low) ** np.linspace(0, 1, goal.radii)
         if dynamics.opponent is not None:
             ladder = jnp.minimum(ladder, high)  # the highest may be the only good one, and the box just there
@@ -204,11 +205,18 @@ def goal_level(
             bad = jnp.where((jnp.cumsum(good, 1) > 0) | ~jnp.any(good, 1, keepdims=True), bad, 0.5)
         crossing = jnp.min(_crossings(grid, bad))
         index = jnp.clip(jnp.searchsorted(ladder, crossing, side="right") - 1, 0, goal.radii - 2)
-        return (ladder[index] / BRACKET_OVERLAP, ladder[index + 1], crossing), None
+        low, high = ladder[index] / BRACKET_OVERLAP, ladder[index + 1]
+        if dynamics.opponent is None:
+            # A region far smaller than the box lies below the first ladder; under a disturbance none does.
+            deeper = first & (crossing < ladder[0]) & (smallest < ladder[0])
+            low, high = jnp.where(deeper, smallest, low), jnp.where(deeper, ladder[0], high)
+        return (low, high, crossing), None
 
+    smallest = jnp.minimum(box, saturated) * SMALLEST
     # Far out the rollouts diverge so steeply that no crossing can be interpolated before the bracket is narrow.
     start = (box * SMALLEST, box, box)
-    (_, _, radius), _ = jax.lax.scan(narrow, start, jax.random.split(key, goal.rounds))
+    rounds = jax.random.split(key, goal.rounds), np.arange(goal.rounds) == 0
+    (_, _, radius), _ = jax.lax.scan(narrow, start, rounds)
     if dynamics.opponent is not None:
         # The residual set must be one: from its rim, and from there outward, V falls.
         residual = dynamics.opponent.uncertainty.residual

@@ -2,6 +2,7 @@
 
 import dataclasses
 from functools import cache, partial
+from typing import ClassVar, final
 
 import equinox as eqx
 import jax
@@ -16,8 +17,8 @@ from rtcd_jax.config import load as configuration
 from rtcd_jax.evaluation import elite_budget, make_evaluate, search_budget
 from rtcd_jax.funnel import MARGIN, _crossings, estimate_funnel, knot_levels
 from rtcd_jax.numerics.ellipsoid import half_widths
-from rtcd_jax.problem import make_problem
-from rtcd_jax.types import Status
+from rtcd_jax.problem import Problem, make_problem
+from rtcd_jax.types import Candidate, Policy, Status, Trajectory
 from rtcd_jax.validation import Dynamics, Rollouts, SamplingBudget
 from rtcd_jax.volume import funnel_volume
 from tests import linear_system as linear
@@ -233,6 +234,40 @@ def test_a_loop_too_stiff_for_its_rollouts_is_not_called_empty(r, dt):
     fastest = r**-0.5
     assert max(fastest * dt / 8, fastest * 0.02 / rollout.MOST_PARTS) > 2.785
     assert _stiff()(_cheap(r, dt)).status == Status.TOO_STIFF
+
+
+@final
+class Cubic(linear.Equations):
+    """x' = -x + 2 x^3 / radius^2 + u, which under u = -x falls to 0 from within `radius`."""
+
+    radius: float = 1.0
+    limit: float = 1.0
+
+    state_names: ClassVar = ("x",)
+    state_units: ClassVar = ("m",)
+
+    def dynamics(self, design, x, u):
+        return jnp.stack([-x[0] + 2 * x[0] ** 3 / self.radius**2 + u[0]])
+
+    def energy(self, design, x):
+        return 0.5 * x[0] ** 2
+
+
+@pytest.mark.parametrize(("radius", "status"), [(0.5, Status.OK), (0.01, Status.OK), (5e-4, Status.FUNNEL_EMPTY)])
+def test_a_region_far_smaller_than_the_box_is_found(radius, status):
+    """The box is that of 1000 times the radius 1 at which the input saturates; a thousandth of that counts as empty."""
+    data = yaml.safe_load(configuration.EXAMPLE) | {"trajectory": {"knots": 4}, "funnel": {"goal": {"rounds": 6}}}
+    plant = Cubic(radius=radius)
+    limits = np.array([1e9]), np.array([1.0])
+    problem = Problem(configuration.parse(data), plant, np.zeros(1), np.zeros(1), *limits, ())
+    zero, one = jnp.zeros((), jnp.int32), jnp.ones((4, 1, 1))
+    rest = Trajectory(jnp.zeros((3, 1)), jnp.zeros((4, 1)), jnp.asarray(0.1), *jnp.zeros((2,)), zero, zero)
+    candidate = Candidate(linear.Nothing(), jnp.ones(1), jnp.ones(1))
+    estimate = partial(estimate_funnel, problem, candidate, Policy(rest, one, one, zero), budget=search_budget(problem))
+    funnel = jax.jit(estimate)(jax.random.key(0))
+    assert funnel.status == status
+    if status == Status.OK:
+        np.testing.assert_allclose(np.sqrt(funnel.levels), radius, rtol=0.03)
 
 
 def test_a_motion_that_leaves_the_boxes_has_an_empty_funnel():

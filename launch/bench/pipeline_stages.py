@@ -61,7 +61,8 @@ def stages(config: Config, population: int) -> Iterator[Stage]:
 
     def goal(candidate, policy):
         rollouts, boxes = prepared(candidate, policy)
-        return funnel.goal_level(rollouts, boxes[-1], key, budget)
+        saturated = funnel._saturating_radius(problem, policy, rollouts.sets.part(slice(-1, None)))
+        return funnel.goal_level(rollouts, boxes[-1], saturated, key, budget)
 
     def scan(candidate, policy, last):
         rollouts, boxes = prepared(candidate, policy)

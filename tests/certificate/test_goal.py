@@ -7,6 +7,7 @@ from scipy.linalg import expm, solve_continuous_are
 from rtcd_jax.certificate import check
 from rtcd_jax.certificate.prove.closed_loop import Loop, claim_of, double, with_digests
 from rtcd_jax.certificate.prove.goal import goal_region
+from rtcd_jax.certificate.prove.levels import goal_level, unit_directions
 from rtcd_jax.elite.elite import Elite
 from tests.certificate import swing
 from tests.certificate.loops import Simulated
@@ -113,3 +114,30 @@ def test_the_closed_form_of_the_unsaturated_loop_arrives_and_is_smaller(upright)
     assert np.mean(closed[upright.value(error) <= upright.rho]) < 0.6
     alone = upright.limit**2 / float((upright.K @ np.linalg.inv(upright.S) @ upright.K.T)[0, 0])
     assert upright.rho > 2 * alone  # the largest ellipse of the same shape without saturation
+
+
+def falling_level(K, S, Q, r, limit):
+    """The lowest V at which that of a linear loop, saturated at `limit`, does not fall any more.
+
+    With s = K e beyond the limit, V' = -e'Q e + r (s^2 - 2 |s| limit): on each line K e = s an interval, at most.
+    """
+    along = np.array([-K[0, 1], K[0, 0]]) / np.linalg.norm(K)
+    s = limit * np.linspace(2, 100, 1_000_001)
+    foot = (K.T / np.sum(K**2) * s).T
+    a, b, c = along @ Q @ along, foot @ Q @ along, np.einsum("si,ij,sj->s", foot, Q, foot) - r * (s**2 - 2 * s * limit)
+    some = b**2 >= a * c
+    foot, b, reach = foot[some], b[some] / a, np.sqrt(b[some] ** 2 - a * c[some]) / a
+    best = np.clip(-(foot @ S @ along) / (along @ S @ along), -b - reach, -b + reach)
+    error = foot + best[:, None] * along
+    return np.min(np.einsum("si,ij,sj->s", error, S, error))
+
+
+@pytest.mark.parametrize("limit", [1e-2, 1e-3])
+def test_the_level_of_a_small_region_is_that_of_the_saturated_linear_loop(limit):
+    """Far below a 400th of the level at which the ellipsoid reaches half a turn. V' is sampled each half degree."""
+    weak = Upright(PAPER | {"torque_limit": limit}, (10.0, 1.0), 1.0)
+    level = goal_level(weak.loop, unit_directions(2))
+    assert level < 1e-4 * weak.loop.goal_box_level()
+    expected = falling_level(weak.K, weak.S, np.diag([10.0, 1.0]), 1.0, limit)
+    assert level == pytest.approx(expected, rel=5e-3)
+    assert 0.5 * level < weak.rho <= level

@@ -7,8 +7,10 @@ import numpy as np
 from rtcd_jax.certificate.check import Refused, require
 from rtcd_jax.certificate.prove.closed_loop import Loop, hermite
 
-LEVELS = 400
-"""Levels at which the fastest growth of V at the goal is sampled."""
+LADDER = np.geomspace(1e-10, 1, 241)
+"""Levels at which the fastest growth of V at the goal is sampled, as fractions of the largest one."""
+BISECTIONS = 12
+"""Of the two levels of the ladder between which V ceases to fall."""
 HEUN_STEPS = 4
 COLLAPSE = 1e-3
 """Fraction of its level that a funnel must keep within an interval."""
@@ -63,12 +65,22 @@ def goal_level(loop: Loop, directions: np.ndarray) -> float:
     Raises:
         Refused: V falls at no level.
     """
-    levels = BOX_FRACTION * loop.goal_box_level() * np.linspace(0, 1, LEVELS + 1)[1:]
-    falls = [loop.goal_growth(level, directions) < 0 for level in levels]
-    first = falls.index(True) if loop.claim.moves_the_goal and True in falls else 0
-    last = falls.index(False, first) if False in falls[first:] else LEVELS
+
+    def falls(level: float) -> bool:
+        return loop.goal_growth(level, directions) < 0
+
+    levels = BOX_FRACTION * loop.goal_box_level() * LADDER
+    fall = [falls(level) for level in levels]
+    first = fall.index(True) if loop.claim.moves_the_goal and True in fall else 0
+    last = fall.index(False, first) if False in fall[first:] else len(levels)
     require(last > first, "goal", "V does not fall")
-    return float(levels[last - 1])
+    if last == len(levels):
+        return float(levels[-1])
+    low, high = levels[last - 1], levels[last]
+    for _ in range(BISECTIONS):
+        middle = np.sqrt(low * high)
+        low, high = (middle, high) if falls(middle) else (low, middle)
+    return float(low)
 
 
 def carried_back(
