@@ -37,11 +37,15 @@ FIRST_SAMPLES = 2000
 
 
 def search_budget(problem: Problem) -> SamplingBudget:
-    """That of a generation: two rounds of held-out samples, a share of them through MJX if the rollouts are mixed."""
+    """That of a generation: two rounds of held-out samples, a share of them through MJX if the rollouts are mixed.
+
+    Where the goal's region is searched for, held-out samples of it are followed, too.
+    """
     funnel = problem.config.funnel
     share = rollout.mjx(problem.plant) if funnel.rollouts == "mixed" else None
     physics = _physics(problem)
-    return SamplingBudget(funnel, Dynamics(physics, physics, share), rounds=2)
+    paths = funnel.trials if problem.at_rest else 0
+    return SamplingBudget(funnel, Dynamics(physics, physics, share), rounds=2, samples_per_knot=paths)
 
 
 def elite_budget(problem: Problem) -> SamplingBudget:

@@ -15,6 +15,7 @@ from rtcd_jax.system.devices import require_float64
 from rtcd_jax.system.errors import ConfigError
 from rtcd_jax.system.errors import Problem as Fault
 from rtcd_jax.types import Uncertainty
+from rtcd_jax.volume import GOAL
 
 AT_REST = 1e-6
 """Largest rate of a goal [state/s]: one typed with 16 digits leaves the rounding of pi times the stiffness."""
@@ -65,6 +66,11 @@ class Problem:
         return self.config.trajectory.knots - 1
 
     @property
+    def at_rest(self) -> bool:
+        """Whether the motion is rest at the goal: its region is all that is searched for."""
+        return self.config.search.objective == GOAL
+
+    @property
     def free(self) -> tuple[Variable, ...]:
         return tuple(variable for variable in self.variables if variable.free)
 
@@ -87,7 +93,7 @@ def make_problem(config: Config) -> Problem:
     problem = Problem(
         config=config,
         plant=plant,
-        start=np.array(config.task.start, float),
+        start=np.array(config.start, float),
         goal=np.array(config.task.goal, float),
         state_limits=np.array(config.task.state_limits, float),
         input_limits=np.array(plant.input_limit, float),

@@ -44,8 +44,11 @@ def plan(problem: Problem, candidates: Candidate) -> Trajectory:
 
     Where these fail, the others follow until one is solved. A candidate's result does not depend on its neighbors'.
     Its status is TRAJECTORY_NOT_SOLVED if no start ended within 1e-9 of the interval map and inside the boxes.
+    Nothing is optimized where the search is for the goal's region alone: the robot rests there.
     """
     settings = problem.config.trajectory
+    if problem.at_rest:
+        return _rest(problem, candidates.q)
     parameters = jax.tree.map(lambda leaf: jnp.moveaxis(leaf, 0, -1), candidates)
     control = interior_point.ControlProblem(
         interval=lambda x, u, h, candidate: interval_map(problem, candidate, x, u, h, settings.substeps),
@@ -73,6 +76,22 @@ def plan(problem: Problem, candidates: Candidate) -> Trajectory:
     us, xs, h = (jnp.moveaxis(leaf, -1, 0) for leaf in (best.us, best.xs, best.h))
     status = jnp.where(best.solved, Status.OK, Status.TRAJECTORY_NOT_SOLVED).astype(jnp.int32)
     return Trajectory(us, xs, h, best.cost, best.defect, best.iterations, status)
+
+
+def _rest(problem: Problem, like: Float[Array, "P n"]) -> Trajectory:
+    """At the goal, in the shortest intervals."""
+    count, knots, n = like.shape[0], problem.intervals + 1, problem.plant.n
+    zero = jnp.zeros(count, like.dtype)
+    none = jnp.zeros(count, jnp.int32)
+    return Trajectory(
+        us=jnp.zeros((count, knots - 1, problem.plant.m), like.dtype),
+        xs=jnp.broadcast_to(jnp.asarray(problem.goal, like.dtype), (count, knots, n)),
+        dt=zero + problem.config.trajectory.step.min,
+        cost=zero,
+        defect=zero,
+        iterations=none,
+        status=none,
+    )
 
 
 def interval_map(

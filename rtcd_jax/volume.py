@@ -41,6 +41,9 @@ class Volume(NamedTuple):
     push: bool = False
 
 
+GOAL = "goal"
+"""Needs no motion: a search for it is about the funnels of robots at rest."""
+
 VOLUMES = {
     "sum": Volume("v_0 + … + v_N, the paper's", lambda at: at.v.sum()),
     "integral": Volume("trapezoid rule over time", lambda at: at.dt * ((at.v[1:] + at.v[:-1]).sum() / 2), seconds=1),
@@ -54,10 +57,11 @@ VOLUMES = {
         lambda at: at.pushes.min(),
         push=True,
     ),
+    GOAL: Volume("v_N of the goal's region", lambda at: at.v[-1]),
 }
 
 
-LATER = ("push",)
+LATER = ("push", GOAL)
 """Those that older runs lack."""
 
 

@@ -84,6 +84,27 @@ def test_batches_in_any_order_give_the_candidates_in_theirs(batch):
     np.testing.assert_array_equal(seen, np.cumsum(x, 1))
 
 
+def test_a_search_for_the_goal_s_region_needs_no_motion():
+    """The region is that at the end of a swing-up, but for what held-out samples took of it, followed to the goal."""
+    config = pipeline.problem().config
+    update = {
+        "search": config.search.model_copy(update={"objective": "goal"}),
+        "trajectory": config.trajectory.model_copy(update={"knots": 3}),
+    }
+    problem = dataclasses.replace(pipeline.problem(), config=config.model_copy(update=update))
+    at_rest = jax.jit(make_evaluate(problem))(pipeline.genomes(), pipeline.GENERATION)
+    moving, motion = pipeline.evaluated(), at_rest.funnel.policy.trajectory
+    np.testing.assert_array_equal(motion.xs, np.broadcast_to(problem.goal, (5, 3, 2)))
+    assert not np.any(motion.us)
+    assert not np.any(motion.iterations)
+    fine = np.asarray(moving.status) == Status.OK
+    np.testing.assert_array_equal(at_rest.status == Status.OK, fine)
+    regions = [np.asarray(evaluation.volumes["goal"])[fine] for evaluation in (moving, at_rest)]
+    assert np.all(regions[1] <= regions[0] * (1 + CLOSE))
+    assert np.all(regions[1] > 0.9 * regions[0])
+    np.testing.assert_array_equal(at_rest.funnel.trials[fine], problem.config.funnel.trials)
+
+
 @pytest.mark.slow
 def test_a_population_is_its_candidates_one_by_one():
     """The program for one is another one: equal but for rounding."""

@@ -136,4 +136,4 @@ def test_a_population_s_volumes_keep_their_order_and_the_checkpoints_names():
     batch = jax.jit(jax.vmap(_volumes))(jax.tree.map(lambda leaf: jnp.stack([leaf, leaf]), funnels))
     assert list(batch.named) == list(VOLUMES)
     paths = [jax.tree_util.keystr(path) for path, _ in jax.tree_util.tree_flatten_with_path(batch)[0]]
-    assert paths == [".per_knot", ".total", ".integral", ".inlet", ".geometric_mean", ".push"]
+    assert paths == [".per_knot", ".total", ".integral", ".inlet", ".geometric_mean", ".push", ".goal"]

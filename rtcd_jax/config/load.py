@@ -37,6 +37,7 @@ from rtcd_jax.config.schema import (
 )
 from rtcd_jax.config.settings import Settings, problems_of
 from rtcd_jax.system.errors import ConfigError, Problem, closest, printable
+from rtcd_jax.volume import GOAL
 
 EXAMPLE = """\
 plant: {name: pendulum}
@@ -99,6 +100,11 @@ class Config(Settings):
             variables |= {f"weights.{letter}.{i}": weight for i, weight in enumerate(weights)}
         return variables | {f"policy.{name}": variable for name, variable in self.policy.variables().items()}
 
+    @property
+    def start(self) -> tuple[float, ...]:
+        """The first state of the nominal motion: the goal where no motion is asked for."""
+        return self.task.goal if self.search.objective == GOAL else self.task.start
+
     def logarithmic(self, key: str) -> bool:
         """Whether the search scales the variable of this dotted key logarithmically."""
         section, _, name = key.partition(".")
@@ -131,8 +137,11 @@ def _ends(task: TaskConfig, trajectory: TrajectoryConfig) -> Iterator[Problem]:
             elif abs(value) > share * limit:
                 text = f"must lie in [-{share * limit:g}, {share * limit:g}] (trajectory.limit_share of the limit)"
                 yield Problem(("task", key, i), text, value)
-    if task.start == task.goal:
-        yield Problem(("task", "goal"), "must differ from task.start", task.goal)
+
+
+def _motion(task: TaskConfig, search: SearchConfig) -> Iterator[Problem]:
+    if task.start == task.goal and search.objective != GOAL:
+        yield Problem(("task", "goal"), f"must differ from task.start, unless search.objective = '{GOAL}'", task.goal)
 
 
 def _design_names(plant: PlantConfig, design: dict[str, Variable]) -> Iterator[Problem]:
@@ -202,6 +211,7 @@ _ACROSS: tuple[Callable[..., Iterator[Problem]], ...] = (
     _sizes,
     _weight_sizes,
     _ends,
+    _motion,
     _design_names,
     _units,
     _positive_design,

@@ -328,7 +328,9 @@ REFINEMENT_STEPS = 400
 
 
 class SearchConfig(Settings):
-    objective: Objective = Field(default="sum", description="volume to maximize")
+    objective: Objective = Field(
+        default="sum", description="volume to maximize; goal: of the region there, without a motion"
+    )
     at_least: dict[str, Annotated[float, Field(gt=0, le=1e12)]] = Field(
         default={},
         description="smallest volumes or push margin, by name, before which the objective counts [their units]",

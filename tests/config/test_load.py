@@ -120,7 +120,7 @@ REFUSED = {
     ),
     "huge limit": ({"task.state_limits.0": 1e308}, "task.state_limits.0 = 1e+308: must be <= 1e+06, or .inf for none"),
     "huge start": ({"task.start.0": 1e7}, "task.start.0 = 10000000.0: must be >= -1e+06 and <= 1e+06; first state"),
-    "no motion": ({"task.goal": [0, 0]}, "task.goal = (0.0, 0.0): must differ from task.start"),
+    "no motion": ({"task.goal": [0, 0]}, "task.goal = (0.0, 0.0): must differ from task.start, unless"),
     "short start": ({"task.start": [0]}, "task.start: must have 2 entries (theta, theta_dot), has 1"),
     "long goal": ({"task.goal": [3, 0, 0]}, "task.goal: must have 2 entries (theta, theta_dot), has 3"),
     "short limits": ({"task.state_limits": [7]}, "task.state_limits: must have 2 entries (theta, theta_dot), has 1"),

@@ -99,6 +99,7 @@ def test_the_arrays_have_the_documented_names_and_shapes(arrays):
         "time": (KNOTS,), "x": (KNOTS, n), "u": (KNOTS - 1, m), "K": (KNOTS, m, n), "S": (KNOTS, n, n),
         "rho": (KNOTS,), "trials": (KNOTS,), "Q": (n, n), "R": (m, m), "K_goal": (m, n), "x_goal": (n,), "u_max": (m,),
         "volumes_sum": (), "volumes_integral": (), "volumes_inlet": (), "volumes_geometric_mean": (),
+        "volumes_goal": (),
         "volumes_push": (), "volumes_per_knot": (KNOTS,), "pushes": (KNOTS, m), "genome": (5,),
     }  # fmt: skip
     assert {name: array.shape for name, array in arrays.items()} == shapes

@@ -56,13 +56,14 @@ def test_the_search_finds_the_known_optimum(mode):
 
 
 @both_modes
-def test_what_bears_more_knots_ranks_better_where_nothing_is_feasible(mode):
+@pytest.mark.parametrize("failed", [Status.FUNNEL_EMPTY, Status.TOO_STIFF])
+def test_what_bears_more_knots_ranks_better_where_nothing_is_feasible(mode, failed):
     """The search comes to the only funnels there are, although no first candidate has one."""
 
     def narrow(genomes, key):
         distance = jnp.linalg.norm(genomes - PEAK, axis=1)
         feasible = distance < 0.1
-        evaluation = population(genomes, 1 - distance, jnp.where(feasible, Status.OK, Status.FUNNEL_EMPTY))
+        evaluation = population(genomes, 1 - distance, jnp.where(feasible, Status.OK, failed))
         borne = jnp.where(feasible, 1.0, 1 - distance / 2)
         return eqx.tree_at(lambda e: e.funnel.borne, evaluation, borne, is_leaf=lambda leaf: leaf is None)
 

@@ -106,7 +106,7 @@ def _columns(folder: Path, config: Config, seed: int, console: Console) -> list[
     if absence:
         console.message(f"{absence}: the best elite is shown alone")
     disturbed = _disturbed(elites["best"], seed)
-    starts = np.stack([np.array(config.task.start), disturbed])
+    starts = np.stack([np.array(config.start), disturbed])
     time = frame_times(list(elites.values()), HOLD, RATE)
     console.message(
         "disturbed start, from the best funnel's first ellipsoid: "

@@ -122,7 +122,7 @@ def frame(axes: "Axes", config: Config, plane: tuple[int, int], view: Float[np.n
     """Start, goal, limits, window and labels of a plane."""
     # An open circle, so that small ellipsoids at the start, and the goal where it lies there too, are seen inside it.
     for point, marker, fill, name in (
-        (config.task.start, "o", "none", "start"),
+        (config.start, "o", "none", "start"),
         (config.task.goal, "*", "white", "goal"),
     ):
         position = [[point[i]] for i in plane]

@@ -102,7 +102,7 @@ def _outline(funnel: FunnelView) -> Plot:
 
 
 def _ends(config: Config, plane: tuple[int, int]) -> list[Plot]:
-    ends = (("start", config.task.start, "circle-open"), ("goal", config.task.goal, "star-open"))
+    ends = (("start", config.start, "circle-open"), ("goal", config.task.goal, "star-open"))
     return [
         {
             "x": [point[plane[0]]],
