@@ -44,7 +44,7 @@ def search_budget(problem: Problem) -> SamplingBudget:
     funnel = problem.config.funnel
     share = rollout.mjx(problem.plant) if funnel.rollouts == "mixed" else None
     physics = _physics(problem)
-    paths = funnel.trials if problem.at_rest else 0
+    paths = funnel.trials if problem.config.at_rest else 0
     return SamplingBudget(funnel, Dynamics(physics, physics, share), rounds=2, samples_per_knot=paths)
 
 

@@ -64,7 +64,7 @@ def estimate_funnel(
     rollouts = Rollouts.of(problem, candidate, policy, budget.funnel)
     sets = rollouts.sets
     boxes = sets.radii_inside(jnp.asarray(problem.state_limits, sets.centers.dtype))
-    saturated = _saturating_radius(problem, policy, sets.part(slice(-1, None)))
+    saturated = saturating_radius(problem, policy, sets.part(slice(-1, None)))
     boxes = jnp.minimum(boxes, REACH * saturated)
     last = goal_level(rollouts, boxes[-1], saturated, keys[0], budget)
 
@@ -162,7 +162,7 @@ class _Step(NamedTuple):
         return self.ends(radii, y, rollout.closed_form(self.rollouts.problem.plant, opponent))[0]
 
 
-def _saturating_radius(problem, policy, goal_set: Ellipsoids):
+def saturating_radius(problem: Problem, policy: Policy, goal_set: Ellipsoids) -> Float[Array, ""]:
     """The radius of the goal's set at which an input of the goal's LQR reaches its limit."""
     rows = solve_lower(goal_set.factors, policy.gains[-1].T[..., None])  # u = -K L'^-1 y
     largest = jnp.sqrt(jnp.sum(rows**2, 0))[:, 0]

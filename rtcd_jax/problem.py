@@ -15,7 +15,6 @@ from rtcd_jax.system.devices import require_float64
 from rtcd_jax.system.errors import ConfigError
 from rtcd_jax.system.errors import Problem as Fault
 from rtcd_jax.types import Uncertainty
-from rtcd_jax.volume import GOAL
 
 AT_REST = 1e-6
 """Largest rate of a goal [state/s]: one typed with 16 digits leaves the rounding of pi times the stiffness."""
@@ -64,11 +63,6 @@ class Problem:
     @property
     def intervals(self) -> int:
         return self.config.trajectory.knots - 1
-
-    @property
-    def at_rest(self) -> bool:
-        """Whether the motion is rest at the goal: its region is all that is searched for."""
-        return self.config.search.objective == GOAL
 
     @property
     def free(self) -> tuple[Variable, ...]:

@@ -47,7 +47,7 @@ def plan(problem: Problem, candidates: Candidate) -> Trajectory:
     Nothing is optimized where the search is for the goal's region alone: the robot rests there.
     """
     settings = problem.config.trajectory
-    if problem.at_rest:
+    if problem.config.at_rest:
         return _rest(problem, candidates.q)
     parameters = jax.tree.map(lambda leaf: jnp.moveaxis(leaf, 0, -1), candidates)
     control = interior_point.ControlProblem(

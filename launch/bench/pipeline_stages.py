@@ -61,7 +61,7 @@ def stages(config: Config, population: int) -> Iterator[Stage]:
 
     def goal(candidate, policy):
         rollouts, boxes = prepared(candidate, policy)
-        saturated = funnel._saturating_radius(problem, policy, rollouts.sets.part(slice(-1, None)))
+        saturated = funnel.saturating_radius(problem, policy, rollouts.sets.part(slice(-1, None)))
         return funnel.goal_level(rollouts, boxes[-1], saturated, key, budget)
 
     def scan(candidate, policy, last):

@@ -101,9 +101,14 @@ class Config(Settings):
         return variables | {f"policy.{name}": variable for name, variable in self.policy.variables().items()}
 
     @property
+    def at_rest(self) -> bool:
+        """Whether the motion is rest at the goal: its region is all that is searched for."""
+        return self.search.objective == GOAL
+
+    @property
     def start(self) -> tuple[float, ...]:
         """The first state of the nominal motion: the goal where no motion is asked for."""
-        return self.task.goal if self.search.objective == GOAL else self.task.start
+        return self.task.goal if self.at_rest else self.task.start
 
     def logarithmic(self, key: str) -> bool:
         """Whether the search scales the variable of this dotted key logarithmically."""
