@@ -117,6 +117,7 @@ class Bundle:
                 "period": self.control_rate.period,
                 "calls_an_interval": self.control_rate.divisor,
                 "states": self.control_rate.states,
+                "start_radius": self.control_rate.radius,
                 "rule": self.control_rate.sentence,
             },
             "monitor": {"guarantee": self.guarantee, "set": PROVED if self.proof else SAMPLED},

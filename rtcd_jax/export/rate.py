@@ -1,8 +1,9 @@
 """The control rate that a funnel asks for: its boundary rolled out with the input held from one call to the next."""
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import final
 
 import numpy as np
@@ -28,13 +29,17 @@ FASTEST = 5000.0
 """Largest control rate that is tried [Hz]."""
 STATES = 4000
 """Of the boundary, over all knots."""
+RADII = 1.0, 0.999, 0.99
+"""Shares of the ellipsoids' radii at which motions start, tried in this order: where the boundary itself is a motion,
+as after a refinement for one exact model, a held input leaves it at any rate.
+"""
 FIRST = 20
 """One in so many is tried first: most rates fail there."""
 STEP = 0.005
 """Longest step of the integrator [s]; the input is held over it, so that it is of fourth order."""
 
 Within = Callable[[float, np.ndarray], np.ndarray]
-"""Time [s], x [states n] -> whether they are in the funnel [states]."""
+"""Time [s], inf for the goal, x [states n] -> whether they are in the funnel [states]."""
 
 
 @final
@@ -42,12 +47,14 @@ Within = Callable[[float, np.ndarray], np.ndarray]
 class ControlRate:
     """The slowest tried rate at which all states stayed, and what was tried.
 
-    `divisor` calls are an interval of the knots; None if no rate sufficed. `states` were rolled out at every rate;
-    `lost` more fail with an input that is continuous in time, too. `failed` says by divisor which share failed.
+    `divisor` calls are an interval of the knots; None if no rate sufficed. `states` were rolled out at every rate, from
+    `radius` times the ellipsoids' boundaries; `lost` more fail with an input that is continuous in time, too. `failed`
+    says by divisor which share failed.
     """
 
     divisor: int | None
     interval: float
+    radius: float
     states: int
     lost: int
     failed: dict[int, float]
@@ -66,7 +73,8 @@ class ControlRate:
     def sentence(self) -> str:
         """What came out, of how many states."""
         failing = [f"{share:.2g} at {d / self.interval:.4g} Hz" for d, share in self.failed.items() if share]
-        states = f"{self.states} states on the funnel's boundary, rolled out with the input held between calls"
+        start = "on the funnel's boundary" if self.radius == 1 else f"at {self.radius:.1%} of the funnel's radius"
+        states = f"{self.states} states {start}, rolled out with the input held between calls"
         if self.lost:
             states += f" ({self.lost} more fail with a continuous input, too)"
         failed = f"; a share of {', '.join(failing)} failed" if failing else ""
@@ -79,7 +87,8 @@ class ControlRate:
 def control_rate(
     elite: Elite, proof: ProvedFunnel | None, show: Callable[[int, int], None] = lambda done, of: None
 ) -> ControlRate:
-    """The slowest tried rate at which the boundaries of a funnel's ellipsoids at the knots stay inside.
+    """The slowest tried rate at which the boundaries of a funnel's ellipsoids at the knots stay inside, or where none
+    suffices what starts a little further in: the first of `RADII` for which one does.
 
     A state stays if it is within the limits at every step, in the funnel at every later knot, in a proved one at every
     call, and arrives at the goal. `show(done, of)` is called after every rate.
@@ -105,24 +114,38 @@ def control_rate(
         held = ~simulate(funnel, f, runge_kutta(f, step), knots, x).failed
     knots, x = knots[held], x[held]
     tried = [divisor for divisor in DIVISORS if divisor / interval <= FASTEST]
+    share = partial(_share_of_failures, funnel, f, within)
+    divisor, radius, failed = None, RADII[-1], {}
+    for radius in RADII:
+        start = elite.x[knots] + radius * (x - elite.x[knots])
+        divisor, failed = _slowest(tried, lambda each, start=start: share(interval / each, knots, start), show)
+        if divisor is not None:
+            break
+    return ControlRate(divisor, interval, radius, len(x), int(np.sum(~held)), failed)
+
+
+def _slowest(
+    tried: Sequence[int], share: Callable[[int], float], show: Callable[[int, int], None]
+) -> tuple[int | None, dict[int, float]]:
+    """The slowest rate of which no share fails, by bisection: what a rate keeps inside, faster ones do. And all shares
+    that were found.
+    """
     failed: dict[int, float] = {}
     slowest, end = 0, len(tried)
-    while slowest < end:  # by bisection: what a rate keeps inside, faster ones do
+    while slowest < end:
         show(len(failed), len(tried).bit_length())
         middle = (slowest + end) // 2
-        share = _share_of_failures(funnel, f, interval / tried[middle], knots, x, within)
-        failed[tried[middle]] = share
-        slowest, end = (middle + 1, end) if share else (slowest, middle)
-    divisor = tried[slowest] if slowest < len(tried) else None
-    return ControlRate(divisor, interval, len(x), int(np.sum(~held)), dict(sorted(failed.items())))
+        failed[tried[middle]] = share(tried[middle])
+        slowest, end = (middle + 1, end) if failed[tried[middle]] else (slowest, middle)
+    return (tried[slowest] if slowest < len(tried) else None), dict(sorted(failed.items()))
 
 
 def _share_of_failures(
-    elite: Elite, f: Dynamics, period: float, knots: np.ndarray, x: np.ndarray, within: Within | None
+    elite: Elite, f: Dynamics, within: Within | None, period: float, knots: np.ndarray, x: np.ndarray
 ) -> float:
     """Of the states of the first round that has any."""
     march = _held(f, period, within)
-    settle = _held(f, period, within and (lambda _, x: within(float(elite.time[-1]), x)))
+    settle = _held(f, period, within and (lambda _, x: within(math.inf, x)))
     shares = (
         float(simulate(elite, f, march, knots[part], x[part], settle).failed.mean())
         for part in (slice(None, None, FIRST), slice(None))
