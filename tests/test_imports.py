@@ -43,7 +43,7 @@ STEPS = (
 # Packages that only some modules may import.
 OWNERS = {
     "mujoco": {"plants.model", "plants.mjx", "plants.lagrange", "plants.draft", "analysis.animate"},
-    "cvxpy": set(),  # tests state the certificates' program with it a second time
+    "cvxpy": {"certificate"},
     "clarabel": {"certificate"},
     "flint": {"certificate"},
     "orbax": {"run"},

@@ -9,9 +9,7 @@ import numpy as np
 import pytest
 import yaml
 
-from rtcd_jax.certificate import check
-from rtcd_jax.certificate.check import Node
-from rtcd_jax.certificate.prove.closed_loop import Loop, claim_of, double, with_digests
+from rtcd_jax.certificate.prove.closed_loop import Loop
 from rtcd_jax.certificate.prove.levels import leveled, unit_directions
 from rtcd_jax.config import load as configuration
 from rtcd_jax.elite.elite import Elite
@@ -22,6 +20,7 @@ from rtcd_jax.refinement import AGREEMENT, DECAY_MARGIN, SETTLING, Refinement
 from rtcd_jax.run.format import arrays_of, evaluation_of, record_of
 from rtcd_jax.types import Candidate, Policy, Trajectory
 from tests import pipeline
+from tests.certificate.claims import claimed
 from tests.linear_system import Nothing
 from tests.pipeline import same
 from tests.test_adversary import Scalar, uncertainty
@@ -124,8 +123,7 @@ def test_levels_are_those_of_the_certificates():
     start = refinement.start(evaluation.candidate, evaluation.funnel.policy, BOTH)
     ours = marched(refinement, start, refinement.begin(start))
     elite = Elite.of(arrays_of(known, evaluation), record_of(known, evaluation))
-    claim = with_digests({**claim_of(elite), "start": [0, double(0.0)]})
-    loop = leveled(Loop(check.read_claim(Node("claim", claim)), elite), unit_directions(2)[:, ::2])
+    loop = leveled(Loop(claimed(elite), elite), unit_directions(2)[:, ::2])
     theirs = np.log(np.pi) - 0.5 * np.linalg.slogdet(loop.values)[1]
     np.testing.assert_allclose(np.exp(ours).sum(), np.exp(theirs).sum(), rtol=0.02)
 
@@ -168,8 +166,7 @@ def test_a_refined_elite_is_stored_and_read_with_its_rates():
     elite = Elite.of(arrays, record)
     assert elite.record["refinement"] == {"free": BOTH}
     np.testing.assert_array_equal(FunnelInterpolant.of(elite).value_rates, policy.value_rates)
-    claim = with_digests({**claim_of(elite), "start": [0, double(0.0)]})
-    np.testing.assert_array_equal(Loop(check.read_claim(Node("claim", claim)), elite).slopes, policy.value_rates)
+    np.testing.assert_array_equal(Loop(claimed(elite), elite).slopes, policy.value_rates)
     again = evaluation_of(known, arrays, record)
     assert same(again.funnel.policy.value_rates, policy.value_rates)
     assert same(again.candidate, evaluation.candidate)

@@ -300,13 +300,16 @@ class CertifyOptions(Options):
     uncertainty: Annotated[Path | None, shown("FILE", "what the run bears")] = Field(
         default=None, description="a YAML of what the proof bears, as `uncertainty` of a configuration; none: one model"
     )
+    solver: Annotated[str, shown("NAME")] = Field(
+        default="CLARABEL", description="of the semidefinite programs, by cvxpy's name: SCS, MOSEK, COPT, ..."
+    )
     workers: int = Field(default=0, description="processes, one elite each; 0 for one a core [-]", ge=0)
 
 
 def certify(options: CertifyOptions, console: Console) -> Exit:
     from rtcd_jax.certificate.prove.run import certify_run
 
-    workers, more = options.workers or cores(), (options.optimize_value, options.uncertainty)
+    workers, more = options.workers or cores(), (options.optimize_value, options.uncertainty, options.solver)
     return _verdict(certify_run(options.run, options.elites, options.guarantee, workers, console, *more))
 
 

@@ -8,12 +8,13 @@ import pytest
 from rtcd_jax.certificate import check
 from rtcd_jax.certificate.prove import backward
 from rtcd_jax.certificate.prove import certify as elite
-from rtcd_jax.certificate.prove.closed_loop import Loop, claim_of, double, with_digests
+from rtcd_jax.certificate.prove.closed_loop import Loop, claim_of
 from rtcd_jax.certificate.prove.run import certify_run, rank_correlation
 from rtcd_jax.cli import main as cli
 from rtcd_jax.elite.elite import Elite
 from rtcd_jax.system.errors import UserError
 from tests.certificate import swing
+from tests.certificate.claims import claimed
 from tests.certificate.folder import folder_with
 from tests.consoles import Screen
 
@@ -21,11 +22,6 @@ from tests.consoles import Screen
 def folder_of(path, **changed):
     arrays, record = swing.elite()
     return folder_with(path, {**arrays, **changed}, record)
-
-
-def claimed(elite):
-    told = {**claim_of(elite), "start": [0, double(0.0)], "push": double(0.0)}
-    return check.read_claim(check.Node("claim", with_digests(told)))
 
 
 def test_the_claim_is_the_elite_bit_by_bit(content):
@@ -108,6 +104,15 @@ def test_a_run_is_certified_in_processes_of_its_own(tmp_path, rung):
     assert "elite 000  interval 1/" in screen.text, "drawn on the terminal"
     assert "back to t = 0.000 s" in screen.text
     assert not list((run / "certificates").glob(".*"))
+
+
+def test_another_solver_proves_the_funnel_too(tmp_path, content):
+    """By the same checker, to nearly the same levels."""
+    run, screen = folder_of(tmp_path), Screen()
+    assert certify_run(run, 1, "proved", 1, screen.console, solver="scs")
+    other = check.check_file(run / "certificates" / "000.json")
+    assert other.notes["solver"] == "SCS"
+    assert other.volumes["sum"] == pytest.approx(check.check(content).volumes["sum"], rel=0.01)
 
 
 class Killed(Exception):

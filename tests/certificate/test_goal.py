@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 from scipy.linalg import expm, solve_continuous_are
 
-from rtcd_jax.certificate import check
-from rtcd_jax.certificate.prove.closed_loop import Loop, claim_of, double, with_digests
+from rtcd_jax.certificate.prove.closed_loop import Loop
 from rtcd_jax.certificate.prove.goal import goal_region
 from rtcd_jax.certificate.prove.levels import goal_level, unit_directions
 from rtcd_jax.elite.elite import Elite
 from tests.certificate import swing
+from tests.certificate.claims import claimed
 from tests.certificate.loops import Simulated
 
 PAPER = {"m": 0.7, "l": 0.4, "b": 0.1, "g": 9.81, "torque_limit": 2.5}
@@ -35,9 +35,7 @@ class Upright:
         }  # fmt: skip
         record = {"plant": "pendulum", "parameters": parameters, "state_limits": [None, None], **swing.PROMISE}
         elite = Elite.of(arrays, record)
-        claim = check.read_claim(
-            check.Node("claim", with_digests({**claim_of(elite), "start": [0, double(0.0)], "push": double(0.0)}))
-        )
+        claim = claimed(elite)
         self.claim, self.loop = claim, Loop(claim, elite)
         region = goal_region(claim, self.loop, exact=True)
         assert region is not None

@@ -164,6 +164,7 @@ OTHERS = {
     "no elite to export": (["export", "run", "--to", "lab", "--elite", "7"], "run has no elite 007; there are 000"),
     "a file to export to": (["export", "run", "--to", "measured.csv"], "measured.csv is a file: an export needs a"),
     "a run to export to": (["export", "run", "--to", "run"], "run is not empty and not an export: it has .lock"),
+    "no such solver": (["certify", "run", "--solver", "NOSUCH"], "--solver = NOSUCH: must be one of CLARABEL, "),
     "no certificate": (["check", "run/no.json"], "run/no.json: No such file or directory; a certificate is"),
     "a folder to check": (["check", "run"], "run: Is a directory; a certificate is RUN/certificates/NNN.json"),
     "nothing to check": (["check"], "0 files: must be one, as in `rtcd check"),

@@ -63,8 +63,8 @@ def on_grid(matrix: np.ndarray) -> list[list]:
 class BackwardProof:
     """The proof of one elite's funnel. `exact` runs the checker after every interval (*proved*)."""
 
-    def __init__(self, claim: Claim, loop: Loop, exact: bool):
-        self.claim, self.loop, self.exact = claim, loop, exact
+    def __init__(self, claim: Claim, loop: Loop, exact: bool, solver: str = program.SOLVER):
+        self.claim, self.loop, self.exact, self.solver = claim, loop, exact, solver
         self._directions = unit_directions(claim.n)
 
     def outlet(self, rho: float) -> ProofState:
@@ -112,7 +112,7 @@ class BackwardProof:
             interval, rho = self._interval(k, start, end, state, decay_margin)
             check.require_bounds(self.claim, check.motion(self.claim, interval), "limits")
             interval, todo, degree = self._models(interval, decay_margin)
-            proof = prove(todo, degree, interval.orders[0], self.exact, self._directions)
+            proof = prove(todo, degree, interval.orders[0], self.exact, self._directions, self.solver)
         except Refused:
             return None
         if proof is None:
@@ -148,7 +148,7 @@ class BackwardProof:
 
 
 def prove(
-    todo: dict[str, Obligation], degree: int, order: int, exact: bool, directions: np.ndarray
+    todo: dict[str, Obligation], degree: int, order: int, exact: bool, directions: np.ndarray, solver: str
 ) -> tuple[dict[str, GramCertificate], float] | None:
     """Gram certificates by case and the least margin; None where a case has none. `exact`: the checker's margin.
 
@@ -165,7 +165,7 @@ def prove(
     if any(program.lowest(data[case], shapes[case], directions) <= 0 for case in todo):
         return None
     for case, each in todo.items():
-        solution = program.solve(data[case], shapes[case])
+        solution = program.solve(data[case], shapes[case], solver)
         if solution is None:
             return None
         certificates[case] = solution.certificate

@@ -18,6 +18,7 @@ from rtcd_jax.certificate.prove.closed_loop import Loop, claim_of, double, doubl
 from rtcd_jax.certificate.prove.goal import GoalRegion, goal_region
 from rtcd_jax.certificate.prove.levels import leveled, unit_directions
 from rtcd_jax.certificate.prove.margins import feedback_speed, push_margin
+from rtcd_jax.certificate.prove.sdp import SOLVER
 from rtcd_jax.certificate.prove.uncertainty import bounds_of, uncertainty_of
 from rtcd_jax.certificate.standing import accepted, remember
 from rtcd_jax.elite.elite import Elite
@@ -67,11 +68,12 @@ def certify_elite(
     on_step: Callable[[Step], None],
     optimize_value: bool = False,
     uncertainty: Path | None = None,
+    solver: str = SOLVER,
 ) -> Outcome | None:
     """Writes `certificates/NAME.json` of a run folder; None if not even a goal region can be shown.
 
     `optimize_value` chooses the ellipsoids' shapes so that the funnel is large. The certificate bears what the run
-    bore, or the `uncertainty` of a file.
+    bore, or the `uncertainty` of a file. `solver` is by cvxpy's name.
 
     Raises:
         UserError: an elite that is not there, or of a plant that the checker does not know.
@@ -86,15 +88,15 @@ def certify_elite(
     loop, exact = Loop(claim, elite), rung == "proved"
     journal = Journal(
         folder / f".{name}.partial.jsonl",
-        {"claim": check.digest(loop_record), "rung": rung, "optimize_value": optimize_value},
+        {"claim": check.digest(loop_record), "rung": rung, "optimize_value": optimize_value, "solver": solver},
     )
     if optimize_value:
         loop = _shaped(loop, journal)
-    region = _region(claim, loop, exact, bounds.rest, journal)
+    region = _region(claim, loop, exact, bounds.rest, journal, solver)
     if region is None:
         return None
     goal, outlet = region
-    proof = BackwardProof(claim, loop, exact)
+    proof = BackwardProof(claim, loop, exact, solver)
     state = _resumed(proof, claim, outlet, journal)
     for proved in proof.intervals_from(state):
         interval = proved.interval
@@ -120,7 +122,7 @@ def certify_elite(
         "claim": with_digests({**loop_record, "start": start, "push": double(push)}),
         "funnel": intervals,
         "goal": goal,
-        "notes": {"elite": name, "rung at writing": rung},
+        "notes": {"elite": name, "rung at writing": rung, "solver": solver},
     }
     outcome = _finish(folder / f"{name}.json", with_digests(content), elite, rung, seconds, journal)
     return outcome._replace(beside=elite.guarantee)
@@ -156,13 +158,13 @@ def _read(loop_record: Mapping[str, Any], elite: Elite) -> Claim:
 
 
 def _region(
-    claim: Claim, loop: Loop, exact: bool, rest: float, journal: Journal
+    claim: Claim, loop: Loop, exact: bool, rest: float, journal: Journal, solver: str
 ) -> tuple[dict[str, Any], float] | None:
     """The goal's record and the outlet's level, from the journal if it has them."""
     for line in journal.lines:
         if "goal" in line:
             return line["goal"], line["outlet"]
-    region = goal_region(claim, loop, exact, rest)
+    region = goal_region(claim, loop, exact, rest, solver)
     if region is None:
         return None
     goal = _goal_record(region)

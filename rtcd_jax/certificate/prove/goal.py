@@ -9,6 +9,7 @@ from rtcd_jax.certificate.check import Claim, Q, Refused, Shell
 from rtcd_jax.certificate.prove.backward import on_grid, prove
 from rtcd_jax.certificate.prove.closed_loop import Loop
 from rtcd_jax.certificate.prove.levels import goal_level, unit_directions
+from rtcd_jax.certificate.prove.sdp import SOLVER
 
 LEVEL_FRACTIONS = (1.0, 0.995, 0.985, 0.97, 0.95, 0.92, 0.88, 0.83, 0.77, 0.7, 0.6, 0.5, 0.35, 0.2, 0.1)
 """Fractions of the level that the samples allow, in the order of trial."""
@@ -32,7 +33,7 @@ class GoalRegion(NamedTuple):
     margin: float
 
 
-def goal_region(claim: Claim, loop: Loop, exact: bool, rest: float = 0.0) -> GoalRegion | None:
+def goal_region(claim: Claim, loop: Loop, exact: bool, rest: float = 0.0, solver: str = SOLVER) -> GoalRegion | None:
     """The region of the first level that can be proved; None if none can.
 
     Where something moves the goal, motions may stay below |y| = `rest`; the least such |y| is looked for.
@@ -43,14 +44,14 @@ def goal_region(claim: Claim, loop: Loop, exact: bool, rest: float = 0.0) -> Goa
     except Refused:
         return None
     for fraction in LEVEL_FRACTIONS:
-        region = _at_level(claim, loop, fraction * most, exact, directions, rest)
+        region = _at_level(claim, loop, fraction * most, exact, directions, rest, solver)
         if region is not None:
             return region
     return None
 
 
 def _at_level(
-    claim: Claim, loop: Loop, rho: float, exact: bool, directions: np.ndarray, most_rest: float
+    claim: Claim, loop: Loop, rho: float, exact: bool, directions: np.ndarray, most_rest: float, solver: str
 ) -> GoalRegion | None:
     last, order = len(loop.u) - 1, ORDERS[claim.n]
     axes = on_grid(loop.axes(last, 1.0, rho, 0.0)[0])
@@ -62,7 +63,8 @@ def _at_level(
             ends = Q(*start.as_integer_ratio()), Q(*end.as_integer_ratio())
             proof = None
             if start or not claim.moves_the_goal:
-                proof = prove(check.goal_obligations(claim, field, *ends), degree, order + 1, exact, directions)
+                todo = check.goal_obligations(claim, field, *ends)
+                proof = prove(todo, degree, order + 1, exact, directions, solver)
             if proof is not None:
                 shells.append(Shell(*ends, proof[0]))
                 least = min(least, proof[1])

@@ -12,6 +12,7 @@ from scipy.stats import spearmanr
 
 from rtcd_jax.certificate.prove.certify import Outcome, Step, certify_elite
 from rtcd_jax.certificate.prove.closed_loop import claim_of
+from rtcd_jax.certificate.prove.sdp import SOLVER, require_solver
 from rtcd_jax.certificate.prove.uncertainty import bounds_of, uncertainty_of
 from rtcd_jax.elite.elite import Elite
 from rtcd_jax.elite.records import require_elites
@@ -33,6 +34,7 @@ def certify_run(
     console: Console,
     optimize_value: bool = False,
     uncertainty: Path | None = None,
+    solver: str = SOLVER,
 ) -> bool:
     """Certificates of a run's best elites; True if every funnel was shown from t = 0 to the goal.
 
@@ -40,8 +42,10 @@ def certify_run(
 
     Raises:
         UserError: no run folder, a run without elites, an elite that cannot be read or is of a plant that the checker
-            does not know, or a folder that cannot be written.
+            does not know, a solver that is not there, or a folder that cannot be written.
     """
+    if solver != SOLVER:
+        solver = require_solver(solver)
     names = require_elites(folder)[:elites]
     for name in names:  # at once, and not from a worker
         elite = Elite.read(folder, name)
@@ -52,7 +56,7 @@ def certify_run(
     former = read_json(summary, "remove it, or make it again") if summary.is_file() else {}
     outcomes: dict[str, Outcome | None] = {}
     clock, reached = Clock(), dict.fromkeys(names, 0.0)
-    for event in _events(folder, names, workers, (rung, optimize_value, uncertainty)):
+    for event in _events(folder, names, workers, (rung, optimize_value, uncertainty, solver)):
         if isinstance(event, Step):
             reached[event.elite] = 1 - event.knot / event.knots
             done = sum(reached.values())
@@ -80,7 +84,7 @@ def certify_run(
 
 
 def _events(
-    folder: Path, names: Sequence[str], workers: int, how: tuple[str, bool, Path | None]
+    folder: Path, names: Sequence[str], workers: int, how: tuple[str, bool, Path | None, str]
 ) -> Iterator[Step | tuple[str, Outcome | None]]:
     """Steps of all elites as they come, and every elite's outcome by its name."""
     # One thread each: there is a worker for every core, and small matrices in many threads cost ten times as much.
@@ -105,8 +109,8 @@ def _remember(steps: Any) -> None:
     _steps = steps
 
 
-def _work(folder: Path, name: str, rung: str, optimize_value: bool, uncertainty: Path | None) -> Outcome | None:
-    return certify_elite(folder, name, rung, _steps.put, optimize_value, uncertainty)
+def _work(folder: Path, name: str, rung: str, *how: Any) -> Outcome | None:
+    return certify_elite(folder, name, rung, _steps.put, *how)
 
 
 def rank_correlation(outcomes: Sequence[Outcome]) -> float:

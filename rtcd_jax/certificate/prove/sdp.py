@@ -6,29 +6,42 @@ maximize t  such that, for every Bernstein index j and modulo |y|^2 = 1,
     sigma_i = sum_a B_a(s) z'S_ia z,    S_ia >= 0
 
 (check has the theorem). The time s stays outside the Gram matrices, and the sphere makes them small: with monomials
-up to degree 3, 7 rows for two states and 30 for four. `solve` hands the program to Clarabel.
+up to degree 3, 7 rows for two states and 30 for four. cvxpy states the program once a shape, with p and g as its
+parameters, and hands it to any solver that is installed: the exact checker decides what a solution is worth.
 """
 
-# pyright: reportAttributeAccessIssue=false, reportOptionalSubscript=false
-# (clarabel ships no types for its native module, scipy says that shapes may be None.)
-
+import contextlib
+import itertools
 import math
+import warnings
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any, NamedTuple, final
+from typing import TYPE_CHECKING, Any, NamedTuple, cast, final
 
 import numpy as np
 import scipy.sparse as sp
 
 from rtcd_jax.certificate import check
 from rtcd_jax.certificate.check import GramCertificate, Obligation, Q
+from rtcd_jax.system.errors import UserError
 
+if TYPE_CHECKING:
+    import cvxpy as cp
+
+SOLVER = "CLARABEL"
+"""By cvxpy's name."""
+OPTIONS: dict[str, dict[str, Any]] = {
+    "CLARABEL": {
+        "tol_gap_abs": 1e-7, "tol_gap_rel": 1e-7, "tol_feas": 1e-9, "max_threads": 1, "presolve_enable": False,
+    },
+    "SCS": {"eps_abs": 1e-7, "eps_rel": 1e-7, "max_iters": 20_000},
+}  # fmt: skip
+"""Of solvers whose own tolerances leave margins of thousandths no room."""
 GRID = 44
 """Gram certificates are rounded to multiples of 2^-44, so that the checker's integers stay short."""
 LIFT = 2.0**-36
 """Added to every diagonal: the solver's matrices are positive definite up to its tolerance only."""
 SAMPLED_TIMES = 7
-SQRT2 = math.sqrt(2)
 
 
 class Shape(NamedTuple):
@@ -63,29 +76,20 @@ def _index(n: int, degree: int) -> dict[tuple[int, ...], int]:
 
 
 @lru_cache(None)
-def _product_map(n: int, degree: int, side: int, up_to: int) -> list[sp.csc_matrix]:
-    """For every monomial m up to `side`: coefficients of (z'G z) m by monomials up to `up_to`.
-
-    They multiply G as a scaled upper triangle by columns.
+def _product_map(n: int, degree: int, side: int) -> sp.csc_matrix:
+    """Coefficients of (z'G z) m on the sphere, from the entries of G, row by row: those of the first monomial m up to
+    the degree `side`, then those of the next one.
     """
-    basis, index, maps = check.monomials(n, degree), _index(n, up_to), []
-    for m in check.monomials(n, side):
-        rows, columns, values = [], [], []
-        for column, (i, j) in enumerate(_triangle(len(basis))):
-            exponents = tuple(map(sum, zip(basis[i], basis[j], m, strict=True)))
-            for e, k in check.reduced(exponents):
-                rows.append(index[e])
+    basis, index = check.monomials(n, degree), _index(n, 2 * degree + 2 * side)
+    rows, columns, values = [], [], []
+    for block, m in enumerate(check.monomials(n, side)):
+        for column, (first, second) in enumerate(itertools.product(basis, basis)):
+            for e, k in check.reduced(tuple(map(sum, zip(first, second, m, strict=True)))):
+                rows.append(block * len(index) + index[e])
                 columns.append(column)
-                values.append(k * (1.0 if i == j else SQRT2))
-        size = len(basis) * (len(basis) + 1) // 2
-        maps.append(sp.csc_matrix((values, (rows, columns)), shape=(len(index), size)))
-    return maps
-
-
-@lru_cache(None)
-def _triangle(rows: int) -> tuple[tuple[int, int], ...]:
-    """The upper triangle by columns, as Clarabel orders it."""
-    return tuple((i, j) for j in range(rows) for i in range(j + 1))
+                values.append(k)
+    shape = len(check.monomials(n, side)) * len(index), len(basis) ** 2
+    return sp.csc_matrix((np.array(values, float), (rows, columns)), shape=shape)
 
 
 def shape_of(todo: Obligation, degree: int, bernstein: int, multiplier: int) -> Shape:
@@ -116,23 +120,6 @@ def _floats(p, todo: Obligation, degree: int, index: dict) -> np.ndarray:
     return table
 
 
-def _multiplier_blocks(shape: Shape, g: np.ndarray) -> list[list[sp.csc_matrix]]:
-    """[constraint][a]: the coefficients of B_a z'S z g_i in all Bernstein parts, stacked, by the triangle of S."""
-    maps = _product_map(shape.n, shape.degree - 1, 1, 2 * shape.degree)
-    high, rest = shape.multiplier, shape.bernstein - shape.multiplier
-    blocks = []
-    for each in g:
-        parts = [sum((m * c for m, c in zip(maps, row, strict=True)), 0 * maps[0]) for row in each]
-        column = []
-        for a in range(high + 1):
-            stack: list[Any] = [0 * maps[0]] * (shape.bernstein + 1)
-            for b, part in enumerate(parts):
-                stack[a + b] = part * (math.comb(high, a) * math.comb(rest, b) / math.comb(high + rest, a + b))
-            column.append(sp.vstack(stack, format="csc"))
-        blocks.append(column)
-    return blocks
-
-
 def lowest(data: Data, shape: Shape, y: np.ndarray) -> float:
     """The least p - error over sampled times and those directions y [n D] where all g >= 0: no margin is larger."""
     powers = _powers(shape.n, 2 * shape.degree, y)
@@ -157,55 +144,88 @@ def _weights(degree: int, t: float) -> np.ndarray:
     return np.array([math.comb(degree, j) * t**j * (1 - t) ** (degree - j) for j in range(degree + 1)])
 
 
-def solve(data: Data, shape: Shape) -> Solution | None:
-    """The best Gram certificate by Clarabel; None where the solver has none, or no positive margin."""
-    import clarabel
+@final
+class Program:
+    """The program of a shape, a `problem` of cvxpy's, with the solution for the data that were given last."""
 
-    gram, parts = _product_map(shape.n, shape.degree, 0, 2 * shape.degree)[0], shape.bernstein + 1
-    rows, multipliers = gram.shape[0], _multiplier_blocks(shape, data.g)
-    constant = np.zeros((rows, 1))
-    constant[0] = 1
-    blocks = [sp.csc_matrix(np.tile(constant, (parts, 1))), sp.block_diag([gram] * parts)]
-    blocks += [block for column in multipliers for block in column]
-    equalities = sp.hstack(blocks, format="csc")
-    sizes = [len(check.monomials(shape.n, shape.degree))] * parts
-    sizes += [len(check.monomials(shape.n, shape.degree - 1))] * (shape.constraints * (shape.multiplier + 1))
-    unknowns = equalities.shape[1]
-    cone = sp.hstack([sp.csc_matrix((unknowns - 1, 1)), -sp.identity(unknowns - 1)], format="csc")
-    cost = np.zeros(unknowns)
-    cost[0] = -1
-    settings = clarabel.DefaultSettings()
-    settings.verbose, settings.max_threads, settings.presolve_enable = False, 1, False
-    settings.tol_gap_abs = settings.tol_gap_rel = 1e-7
-    settings.tol_feas = 1e-9
-    cones = [clarabel.ZeroConeT(equalities.shape[0]), *map(clarabel.PSDTriangleConeT, sizes)]
-    solution = clarabel.DefaultSolver(
-        sp.csc_matrix((unknowns, unknowns)),
-        cost,
-        sp.vstack([equalities, cone], format="csc"),
-        np.concatenate([data.p.ravel(), np.zeros(unknowns - 1)]),
-        cones,
-        settings,
-    ).solve()
-    x = np.asarray(solution.x)
-    if str(solution.status) not in ("Solved", "AlmostSolved") or not np.all(np.isfinite(x)) or x[0] <= 0:
-        return None
-    return Solution(float(x[0]), _gram_certificate(shape, x[1:], sizes))
+    def __init__(self, shape: Shape):
+        import cvxpy as cp
+
+        def positive(degree: int) -> "cp.Variable":
+            rows = len(check.monomials(n, degree))
+            return cp.Variable((rows, rows), PSD=True)
+
+        n, parts, high, rest = shape.n, shape.bernstein + 1, shape.multiplier, shape.bernstein - shape.multiplier
+        gram, sides = _product_map(n, shape.degree, 0), _product_map(n, shape.degree - 1, 1)
+        size, side = len(check.monomials(n, 2 * shape.degree)), len(check.monomials(n, 1))
+        self._p = cp.Parameter((parts, size))
+        self._g = [cp.Parameter((rest + 1, side)) for _ in range(shape.constraints)]
+        self._gram = [positive(shape.degree) for _ in range(parts)]
+        self._multipliers = [[positive(shape.degree - 1) for _ in range(high + 1)] for _ in self._g]
+        t = cp.Variable()
+        sums: list[Any] = [gram @ cp.vec(each, order="C") + t * np.eye(size)[0] for each in self._gram]
+        for g, multipliers in zip(self._g, self._multipliers, strict=True):
+            for a, sigma in enumerate(multipliers):
+                products = cp.reshape(sides @ cp.vec(sigma, order="C"), (size, side), order="F") @ g.T
+                for b in range(rest + 1):
+                    weight = math.comb(high, a) * math.comb(rest, b) / math.comb(high + rest, a + b)
+                    sums[a + b] += weight * products[:, b]
+        self._degree = shape.degree
+        self.problem = cp.Problem(cp.Maximize(t), [each == self._p[j] for j, each in enumerate(sums)])
+
+    def margin(self, data: Data, solver: str = SOLVER) -> float:
+        """The largest margin; -inf where the solver finds none."""
+        import cvxpy as cp
+
+        self._p.value = data.p
+        for parameter, value in zip(self._g, data.g, strict=True):
+            parameter.value = value
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", UserWarning)  # "may be inaccurate": the checker decides
+            try:
+                self.problem.solve(solver=solver, warm_start=False, **OPTIONS.get(solver, {}))
+            except cp.SolverError:
+                return -math.inf
+        solved = self.problem.status in (cp.OPTIMAL, cp.OPTIMAL_INACCURATE)
+        return float(cast(float, self.problem.value)) if solved else -math.inf
+
+    def certificate(self) -> GramCertificate:
+        """The solution as exact matrices on the grid, lifted to be positive definite."""
+        multipliers = [[_exact(each.value) for each in of_one] for of_one in self._multipliers]
+        return GramCertificate(self._degree, [_exact(each.value) for each in self._gram], multipliers)
 
 
-def _gram_certificate(shape: Shape, x: np.ndarray, sizes: list[int]) -> GramCertificate:
-    """The solver's triangles as exact matrices on the grid, lifted to be positive definite."""
-    ends = np.cumsum([rows * (rows + 1) // 2 for rows in sizes])
-    matrices = [_exact(rows, part) for rows, part in zip(sizes, np.split(x, ends[:-1]), strict=True)]
-    parts, each = shape.bernstein + 1, shape.multiplier + 1
-    rest = matrices[parts:]
-    return GramCertificate(shape.degree, matrices[:parts], [rest[i : i + each] for i in range(0, len(rest), each)])
+@lru_cache(None)
+def program_of(shape: Shape) -> Program:
+    """The program of a shape, stated at its first use."""
+    return Program(shape)
 
 
-def _exact(rows: int, triangle: np.ndarray) -> list[list]:
-    matrix = np.zeros((rows, rows))
-    for value, (i, j) in zip(triangle, _triangle(rows), strict=True):
-        matrix[i, j] = matrix[j, i] = value if i == j else value / SQRT2
+def solve(data: Data, shape: Shape, solver: str = SOLVER) -> Solution | None:
+    """The best Gram certificate by a solver of cvxpy's; None where it has none, or no positive margin."""
+    program = program_of(shape)
+    margin = program.margin(data, solver)
+    return Solution(margin, program.certificate()) if margin > 0 else None
+
+
+def require_solver(name: str) -> str:
+    """The name as cvxpy has it. Raises UserError unless it is installed and solves semidefinite programs."""
+    import cvxpy as cp
+
+    smallest = cp.Problem(cp.Minimize(cp.trace(cp.Variable((2, 2), PSD=True))))
+    able = []
+    for each in cp.installed_solvers():
+        with contextlib.suppress(cp.SolverError):
+            smallest.get_problem_data(each)
+            able.append(each)
+    if name.upper() not in able:
+        raise UserError(
+            f"--solver = {name}: must be one of {', '.join(able)}, which are installed and solve semidefinite programs"
+        )
+    return name.upper()
+
+
+def _exact(matrix: Any) -> list[list]:
     lift = max(LIFT, LIFT - float(np.linalg.eigvalsh(matrix)[0]))
-    grid = np.rint((matrix + lift * np.eye(rows)) * 2.0**GRID)
+    grid = np.rint((matrix + lift * np.eye(len(matrix))) * 2.0**GRID)
     return [[Q(int(c), 1 << GRID) for c in row] for row in grid]
