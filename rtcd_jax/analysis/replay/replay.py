@@ -16,7 +16,8 @@ from jaxtyping import Bool, Float
 
 from rtcd_jax.analysis.replay.measured import Measured, jumps, read_measured, unwrapped
 from rtcd_jax.analysis.report.canvas import BLACK, GRAY, LIGHT, WIDTH, blank, shared_legend, written
-from rtcd_jax.analysis.report.funnels import draw_shadows, frame, window
+from rtcd_jax.analysis.report.funnels import draw_plane
+from rtcd_jax.analysis.report.plane import plane_of
 from rtcd_jax.analysis.report.reading import BLUE, VERMILION, FunnelView
 from rtcd_jax.analysis.report.shapes import planes
 from rtcd_jax.config.load import Config
@@ -176,14 +177,11 @@ def _draw(config: Config, funnel: FunnelView, replay: Replay, folder: Path, name
     pairs = planes(replay.measured.x.shape[1])
     with blank((WIDTH, 3.2 * len(pairs) + 2.2)) as figure:
         *panels, ratio = figure.subplots(len(pairs) + 1, 1, height_ratios=[3.2] * len(pairs) + [2.2])
-        for axes, plane in zip(panels, pairs, strict=True):
-            draw_shadows(axes, [funnel], plane)
-            motion = replay.measured.x[:, plane]
+        for axes, pair in zip(panels, pairs, strict=True):
+            draw_plane(axes, plane_of(config, [funnel], pair, motion=replay.measured.x))
+            motion = replay.measured.x[:, pair]
             axes.plot(*motion.T, color=BLUE, label="measured", zorder=4)
             axes.plot(*motion[~replay.inside].T, ".", ms=4, color=BLACK, label="outside", zorder=5)
-            low, high = window([funnel], plane)
-            view = np.stack([np.minimum(low, motion.min(0)), np.maximum(high, motion.max(0))])
-            frame(axes, config, plane, view)
         figure.legend(**shared_legend(panels), loc="outside upper center")
         ratio.semilogy(replay.measured.time, np.maximum(replay.ratio, LEAST), color=BLUE)
         ratio.axhline(1, color=BLACK, lw=1, ls="--")

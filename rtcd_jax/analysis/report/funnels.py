@@ -1,17 +1,18 @@
 """Print figures of funnels: side by side in time's colors, over one another, and their levels over time."""
 
 import functools
-from collections.abc import Callable, Iterator, Mapping, Sequence
+import itertools
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from jaxtyping import Float
 
 from rtcd_jax.analysis.report.canvas import BLACK, GRAY, SMALL, WIDTH, blank, draw_panel, shared_legend, written
 from rtcd_jax.analysis.report.charts import Chart, Curve, Panel
+from rtcd_jax.analysis.report.plane import Plane, Shadow, plane_of
 from rtcd_jax.analysis.report.reading import FunnelView, Run, funnel_views
-from rtcd_jax.analysis.report.shapes import outlines, planes, projections
+from rtcd_jax.analysis.report.shapes import planes
 from rtcd_jax.analysis.report.words import guarantee, listed, quantity, volume_unit, words
 from rtcd_jax.config.load import Config
 from rtcd_jax.volume import VOLUMES
@@ -20,9 +21,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.cm import ScalarMappable
     from matplotlib.figure import Figure
-
-MANY = 100
-"""Knots from which on lines and marks are finer, and outlines coarser."""
 
 
 def draw_funnels(run: Run) -> list[Path]:
@@ -73,9 +71,8 @@ def draw_over(runs: Sequence[Run], folder: Path, name: str) -> list[Path]:
     config, funnels, pairs = runs[0].config, funnel_views(runs), planes(runs[0].best.x.shape[1])
     with blank((WIDTH, 3.4 * len(pairs) + 2.6)) as figure:
         *panels, below = figure.subplots(len(pairs) + 1, 1, height_ratios=[3.4] * len(pairs) + [2.0])
-        for axes, plane in zip(panels, pairs, strict=True):
-            draw_shadows(axes, funnels, plane)
-            frame(axes, config, plane, window(funnels, plane))
+        for axes, pair in zip(panels, pairs, strict=True):
+            draw_plane(axes, plane_of(config, funnels, pair))
         figure.legend(**shared_legend(panels), loc="outside upper center")
         draw_panel(below, volumes(config, funnels, _short_label))
         below.set_xlabel("time [s]")
@@ -84,54 +81,35 @@ def draw_over(runs: Sequence[Run], folder: Path, name: str) -> list[Path]:
         return written(figure, folder, name)
 
 
-def draw_shadows(axes: "Axes", funnels: Sequence[FunnelView], plane: tuple[int, int]) -> None:
-    """Funnels in their own colors over one another, the one that reaches farthest lowest."""
+def draw_plane(axes: "Axes", plane: Plane) -> None:
+    """Funnels in their own colors over one another, the largest lowest, with start, goal, limits and labels."""
     from matplotlib.collections import PolyCollection
     from matplotlib.colors import to_rgba
     from matplotlib.patches import PathPatch
     from matplotlib.path import Path as Curve
 
-    for funnel in sorted(funnels, key=lambda funnel: -float(funnel.elite.volumes_per_knot.max())):
-        curves = list(shadow(funnel, plane))
+    for shadow in plane.shadows:
+        color = shadow.funnel.color
         # One curve of all ellipses is filled once: their shades do not add up where they overlap.
-        whole = Curve.make_compound_path(*map(Curve, curves))
+        whole = Curve.make_compound_path(*map(Curve, shadow.outlines))
         # add_patch would look at every segment for limits that are set anyway.
-        axes.add_artist(PathPatch(whole, facecolor=to_rgba(funnel.color, 0.15), lw=0))
-        edges = to_rgba(funnel.color, 0.45)
-        width = 0.5 if len(curves) <= MANY else 0.25
-        axes.add_collection(PolyCollection(curves, facecolors="none", edgecolors=edges, lw=width))
-        axes.plot(*funnel.elite.x[:, plane].T, color=funnel.color, label=funnel.label, zorder=3)
+        axes.add_artist(PathPatch(whole, facecolor=to_rgba(color, 0.15), lw=0))
+        width = 0.25 if shadow.fine else 0.5
+        edges = {"facecolors": "none", "edgecolors": to_rgba(color, 0.45), "lw": width}
+        axes.add_collection(PolyCollection(list(shadow.outlines), **edges))
+        axes.plot(*shadow.motion.T, color=color, label=shadow.funnel.label, zorder=3)
+    _frame(axes, plane)
 
 
-def shadow(
-    funnel: FunnelView, plane: tuple[int, int], points: int | None = None
-) -> Float[np.ndarray, "knots points 2"]:
-    """Outlines of a funnel's ellipsoids in a plane."""
-    points = points or (181 if len(funnel.elite.time) <= MANY else 91)
-    return outlines(funnel.elite.x[:, plane], projections(funnel.elite.S, funnel.elite.rho, plane), points)
-
-
-def window(funnels: Sequence[FunnelView], plane: tuple[int, int]) -> Float[np.ndarray, "2 2"]:
-    """Lower and upper corner of a plane's window: all funnels with a margin."""
-    points = np.concatenate([shadow(funnel, plane).reshape(-1, 2) for funnel in funnels])
-    low, high = points.min(0), points.max(0)
-    return np.stack([low, high]) + 0.04 * np.outer([-1, 1], high - low)
-
-
-def frame(axes: "Axes", config: Config, plane: tuple[int, int], view: Float[np.ndarray, "2 2"]) -> None:
+def _frame(axes: "Axes", plane: Plane) -> None:
     """Start, goal, limits, window and labels of a plane."""
     # An open circle, so that small ellipsoids at the start, and the goal where it lies there too, are seen inside it.
-    for point, marker, fill, name in (
-        (config.start, "o", "none", "start"),
-        (config.task.goal, "*", "white", "goal"),
-    ):
-        position = [[point[i]] for i in plane]
-        axes.plot(*position, marker, mfc=fill, mec=BLACK, ms=9, ls="none", label=name, zorder=4)
-    for axis, value in visible_limits(config, plane, view):
+    for (x, y), marker, fill, name in ((plane.start, "o", "none", "start"), (plane.goal, "*", "white", "goal")):
+        axes.plot([x], [y], marker, mfc=fill, mec=BLACK, ms=9, ls="none", label=name, zorder=4)
+    for axis, value in plane.visible_limits:
         (axes.axvline, axes.axhline)[axis](value, color=GRAY, ls="--", lw=1, label="state limit")
-    axes.set(xlim=view[:, 0], ylim=view[:, 1])
-    states = list(config.plant.states.items())
-    axes.set(xlabel=quantity(*states[plane[0]]), ylabel=quantity(*states[plane[1]]))
+    horizontal, vertical = itertools.starmap(quantity, plane.states)
+    axes.set(xlim=plane.window[:, 0], ylim=plane.window[:, 1], xlabel=horizontal, ylabel=vertical)
 
 
 def _beside(figure: "Figure", run: Run) -> None:
@@ -139,12 +117,13 @@ def _beside(figure: "Figure", run: Run) -> None:
     grid = figure.add_gridspec(len(pairs) + 1, len(funnels), height_ratios=[2.9] * len(pairs) + [2.0])
     colors = _time_colors(max(float(funnel.elite.time[-1]) for funnel in funnels))
     panels = []
-    for row, plane in enumerate(pairs):
-        view = window(funnels, plane)
+    for row, pair in enumerate(pairs):
+        plane = plane_of(config, funnels, pair)
+        shadows = {shadow.funnel.label: shadow for shadow in plane.shadows}
         for place, funnel in enumerate(funnels):
             axes = figure.add_subplot(grid[row, place])
-            _draw_in_time(axes, funnel, plane, colors)
-            frame(axes, config, plane, view)
+            _draw_in_time(axes, shadows[funnel.label], colors)
+            _frame(axes, plane)
             if row == 0:
                 axes.set_title(_title(config, funnel))
             panels.append(axes)
@@ -171,23 +150,13 @@ def _time_colors(duration: float) -> "ScalarMappable":
     return ScalarMappable(Normalize(0, duration), shades)
 
 
-def _draw_in_time(axes: "Axes", funnel: FunnelView, plane: tuple[int, int], colors: "ScalarMappable") -> None:
+def _draw_in_time(axes: "Axes", shadow: Shadow, colors: "ScalarMappable") -> None:
     from matplotlib.collections import PolyCollection
 
-    shades = colors.to_rgba(funnel.elite.time)
+    shades = colors.to_rgba(shadow.funnel.elite.time)
     faces = shades * np.array([1, 1, 1, 0.05])
-    axes.add_collection(PolyCollection(list(shadow(funnel, plane)), facecolors=faces, edgecolors=shades, lw=0.6))
-    axes.plot(*funnel.elite.x[:, plane].T, color=BLACK, label="nominal motion")
-
-
-def visible_limits(
-    config: Config, plane: tuple[int, int], view: Float[np.ndarray, "2 2"]
-) -> Iterator[tuple[int, float]]:
-    """The limits on |x_i| that the window shows: on which of the plane's axes, and where."""
-    for axis, (i, (low, high)) in enumerate(zip(plane, view.T, strict=True)):
-        for value in (-config.task.state_limits[i], config.task.state_limits[i]):
-            if low <= value <= high:
-                yield axis, value
+    axes.add_collection(PolyCollection(list(shadow.outlines), facecolors=faces, edgecolors=shades, lw=0.6))
+    axes.plot(*shadow.motion.T, color=BLACK, label="nominal motion")
 
 
 def _known_volumes(funnel: FunnelView) -> dict[str, float]:

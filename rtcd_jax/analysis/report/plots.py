@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from rtcd_jax.analysis.report.canvas import BLACK, GRAY
-from rtcd_jax.analysis.report.funnels import MANY, shadow, visible_limits, window
+from rtcd_jax.analysis.report.plane import Plane, Shadow, plane_of
 from rtcd_jax.analysis.report.reading import FunnelView
 from rtcd_jax.analysis.report.shapes import planes
 from rtcd_jax.analysis.report.traces import Plot, faint, numbers
@@ -18,46 +18,43 @@ POINTS = 49
 
 def planes_of(config: Config, funnels: Sequence[FunnelView]) -> dict[str, Plot]:
     """The funnels in every plane of a coordinate and its velocity, by the plots' names on the page."""
-    pairs = planes(len(config.plant.states))
-    return {f"plane{i}": plane_plot(config, funnels, plane) for i, plane in enumerate(pairs)}
+    unit, pairs = volume_unit(config), planes(len(config.plant.states))
+    return {f"plane{i}": plane_plot(plane_of(config, funnels, pair, POINTS), unit) for i, pair in enumerate(pairs)}
 
 
-def plane_plot(config: Config, funnels: Sequence[FunnelView], plane: tuple[int, int]) -> Plot:
+def plane_plot(plane: Plane, unit: str) -> Plot:
     """Funnels over one another; `moments` says which traces the time slider fills from which."""
-    lowest_first = sorted(funnels, key=lambda funnel: -float(funnel.elite.volumes_per_knot.max()))
-    bodies = [_body(funnel, plane) for funnel in lowest_first]
-    motions = [_motion(config, funnel, plane) for funnel in lowest_first]
-    moments = [_outline(funnel) for funnel in lowest_first]
-    view = window(funnels, plane)
-    names = list(config.plant.states.items())
-    labels = [f"{letter(name)} [{unit}]" for name, unit in (names[i] for i in plane)]
-    count = len(funnels)
+    bodies = [_body(shadow) for shadow in plane.shadows]
+    motions = [_motion(shadow, unit) for shadow in plane.shadows]
+    moments = [_outline(shadow.funnel) for shadow in plane.shadows]
+    labels = [f"{letter(name)} [{dimension}]" for name, dimension in plane.states]
+    count = len(plane.shadows)
     return {
-        "data": [*bodies, *motions, *moments, *_ends(config, plane)],
+        "data": [*bodies, *motions, *moments, *_ends(plane)],
         "layout": {
-            "xaxis": {"title": {"text": labels[0]}, "range": numbers(view[:, 0])},
-            "yaxis": {"title": {"text": labels[1]}, "range": numbers(view[:, 1])},
-            "shapes": [_limit(axis, value) for axis, value in visible_limits(config, plane, view)],
+            "xaxis": {"title": {"text": labels[0]}, "range": numbers(plane.window[:, 0])},
+            "yaxis": {"title": {"text": labels[1]}, "range": numbers(plane.window[:, 1])},
+            "shapes": [_limit(axis, value) for axis, value in plane.visible_limits],
         },
         "moments": [
-            {"source": i, "trace": 2 * count + i, "times": numbers(funnel.elite.time), "points": POINTS + 1}
-            for i, funnel in enumerate(lowest_first)
+            {"source": i, "trace": 2 * count + i, "times": numbers(shadow.funnel.elite.time), "points": POINTS + 1}
+            for i, shadow in enumerate(plane.shadows)
         ],
     }
 
 
-def _body(funnel: FunnelView, plane: tuple[int, int]) -> Plot:
+def _body(shadow: Shadow) -> Plot:
     """All ellipses as one trace, a gap behind each."""
-    curves = shadow(funnel, plane, POINTS)
-    gaps = np.full((len(curves), 1, 2), np.nan)
-    x, y = np.concatenate([curves, gaps], axis=1).reshape(-1, 2).T
+    gaps = np.full((len(shadow.outlines), 1, 2), np.nan)
+    x, y = np.concatenate([shadow.outlines, gaps], axis=1).reshape(-1, 2).T
+    funnel = shadow.funnel
     return {
         "x": _rounded(x),
         "y": _rounded(y),
         "mode": "lines",
         "fill": "toself",
         "fillcolor": faint(funnel.color, 0.10),
-        "line": {"color": faint(funnel.color, 0.45), "width": 0.6 if len(funnel.elite.time) <= MANY else 0.3},
+        "line": {"color": faint(funnel.color, 0.45), "width": 0.3 if shadow.fine else 0.6},
         "name": funnel.label,
         "legendgroup": funnel.label,
         "showlegend": False,
@@ -65,22 +62,19 @@ def _body(funnel: FunnelView, plane: tuple[int, int]) -> Plot:
     }
 
 
-def _motion(config: Config, funnel: FunnelView, plane: tuple[int, int]) -> Plot:
+def _motion(shadow: Shadow, unit: str) -> Plot:
     """The nominal motion, which tells of a knot what is under the pointer."""
-    unit = volume_unit(config)
-    x, y = (_rounded(funnel.elite.x[:, i]) for i in plane)
+    x, y = map(_rounded, shadow.motion.T)
+    funnel, elite = shadow.funnel, shadow.funnel.elite
     return {
         "x": x,
         "y": y,
         "mode": "lines+markers",
         "line": {"color": funnel.color, "width": 1.5},
-        "marker": {"size": 4 if len(funnel.elite.time) <= MANY else 2.5},
+        "marker": {"size": 2.5 if shadow.fine else 4},
         "name": funnel.label,
         "legendgroup": funnel.label,
-        "customdata": [
-            numbers(row)
-            for row in np.stack([funnel.elite.time, funnel.elite.rho, funnel.elite.volumes_per_knot], axis=1)
-        ],
+        "customdata": [numbers(row) for row in np.stack([elite.time, elite.rho, elite.volumes_per_knot], axis=1)],
         "hovertemplate": (
             "t = %{customdata[0]:.3f} s<br>(%{x:.4g}, %{y:.4g})<br>ρ = %{customdata[1]:.3g}<br>"
             f"volume %{{customdata[2]:.3g}} {unit}<extra>{funnel.label}</extra>"
@@ -101,17 +95,17 @@ def _outline(funnel: FunnelView) -> Plot:
     }
 
 
-def _ends(config: Config, plane: tuple[int, int]) -> list[Plot]:
-    ends = (("start", config.start, "circle-open"), ("goal", config.task.goal, "star-open"))
+def _ends(plane: Plane) -> list[Plot]:
+    ends = (("start", plane.start, "circle-open"), ("goal", plane.goal, "star-open"))
     return [
         {
-            "x": [point[plane[0]]],
-            "y": [point[plane[1]]],
+            "x": [x],
+            "y": [y],
             "mode": "markers",
             "marker": {"symbol": symbol, "size": 12, "color": BLACK, "line": {"width": 1.5}},
             "name": name,
         }
-        for name, point, symbol in ends
+        for name, (x, y), symbol in ends
     ]
 
 
