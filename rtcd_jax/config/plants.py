@@ -281,8 +281,9 @@ class MjcfPlant(RobotPlant):
         of_input = {f"{motor.name}_limit": motor.joint.units[2] for motor in names.motors}
         known = {name: of_input.get(name, "") for name in self.values()}
         known |= {name: each.unit for name, each in self.constants.items()}
+        of_set = (value for fields in self.set.values() for values in fields.values() for value in values)
         used = dict.fromkeys(
-            name for value in (*_all_values(self.set), *derived.values()) for name in needs(value) if name not in known
+            name for value in (*of_set, *derived.values()) for name in needs(value) if name not in known
         )
         zeros = ", ".join(
             f"{joint.name} and {joint.name}_dot along its {'turning' if joint.hinge else 'sliding'} axis"
@@ -363,12 +364,6 @@ class PythonPlant(PlantConfig):
     def uncertain(self) -> tuple[str, ...]:
         fields = self.plant().__dataclass_fields__
         return tuple(name for name in fields if not name.endswith("_limit"))
-
-
-def _all_values(settings: Edits) -> Iterator[Value]:
-    for fields in settings.values():
-        for values in fields.values():
-            yield from values
 
 
 @cache

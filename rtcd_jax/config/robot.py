@@ -128,9 +128,9 @@ def read_edits(names: Names, settings: Mapping[str, Mapping[str, Sequence[Value]
             if isinstance(kind, Problem):
                 yield kind
                 continue
-            sizes = {3} if kind == OPTION else {FIELDS[kind][field][1]}
-            if len(values) not in sizes:
-                text = f"must have {_numbers(sizes)}, has {len(values)}"
+            size = 3 if kind == OPTION else FIELDS[kind][field][1]
+            if len(values) != size:
+                text = f"must have {size} number{'s' * (size > 1)}, has {len(values)}"
                 yield Problem((name, field), text, list(values))
             else:
                 yield Edit(kind, name.removeprefix(f"{kind}."), field, tuple(values))
@@ -190,8 +190,3 @@ def _kind(names: Names, name: str, field: str) -> str | Problem:
         say = " or ".join(f"{kind}.{name}" for kind in fitting)
         return Problem((name, field), f"is meant of which? The MJCF has {' and '.join(fitting)} {name}: say {say}")
     return fitting[0]
-
-
-def _numbers(sizes: set[int]) -> str:
-    (size,) = sizes
-    return "1 number" if size == 1 else f"{size} numbers"

@@ -4,7 +4,6 @@ from pathlib import Path
 from typing import Any
 
 from rtcd_jax.config.load import Config, parse, resolved
-from rtcd_jax.config.schema import Variable
 from rtcd_jax.elite.records import read_config, read_elite, require_elites
 from rtcd_jax.system.errors import UserError
 
@@ -23,7 +22,8 @@ def begun_from(config: Config, run: Path) -> Config:
     for name, variable in config.variables().items():
         if variable.free:
             section, *keys = name.split(".")
-            _place(data, section, keys)["initial"] = _inside(variable, _known(record, section, keys, run))
+            known = _known(record, section, keys, run)
+            _place(data, section, keys)["initial"] = min(max(known, variable.min), variable.max)
     return parse(data)
 
 
@@ -38,7 +38,3 @@ def _known(record: Any, section: str, keys: list[str], run: Path) -> float:
         return float(_place(record, section, keys))
     except (KeyError, IndexError, TypeError, ValueError):
         raise UserError(f"--from {run}: its best elite does not say its {'.'.join((section, *keys))}") from None
-
-
-def _inside(variable: Variable, value: float) -> float:
-    return min(max(value, variable.min), variable.max)

@@ -60,7 +60,7 @@ def draft(path: Path) -> str:
         *(f"  #   {line}" for line in _numbers(model)),
         "",
         "task:",
-        f"  start: [{', '.join((*map(_angle, start), *('0' for _ in hinges)))}]   # {_units(states)}",
+        f"  start: [{', '.join((*map(_angle, start), *('0' for _ in hinges)))}]   # {', '.join(states.values())}",
         f"  goal: [{', '.join((*map(_angle, goal), *('0' for _ in hinges)))}]",
         f"  state_limits: [{', '.join(bounds)}]   # or .inf",
         "",
@@ -123,7 +123,3 @@ def _numbers(model: mujoco.MjModel) -> Iterator[str]:
 
 def _angle(value: float) -> str:
     return "pi" if value else "0"
-
-
-def _units(states: dict[str, str]) -> str:
-    return ", ".join(states.values())

@@ -173,7 +173,11 @@ def _faults(model: mujoco.MjModel) -> Iterator[str]:
         ("contact pairs", objects.mjOBJ_PAIR, np.ones(model.npair)),
         (f"joint limits are on ({own_limits})", objects.mjOBJ_JOINT, model.jnt_limited),
         (f"tendon limits are on ({own_limits})", objects.mjOBJ_TENDON, model.tendon_limited),
-        ("friction loss, which is not smooth", objects.mjOBJ_JOINT, _of_joints(model, model.dof_frictionloss)),
+        (
+            "friction loss, which is not smooth",
+            objects.mjOBJ_JOINT,
+            np.bincount(model.dof_jntid, weights=model.dof_frictionloss != 0, minlength=model.njnt),
+        ),
         ("friction loss, which is not smooth", objects.mjOBJ_TENDON, model.tendon_frictionloss),
         ("equality constraints", objects.mjOBJ_EQUALITY, np.ones(model.neq)),
         (f"force limits are on ({own_clip})", objects.mjOBJ_ACTUATOR, model.actuator_forcelimited),
@@ -182,7 +186,3 @@ def _faults(model: mujoco.MjModel) -> Iterator[str]:
         names = [mujoco.mj_id2name(model, kind, int(i)) or f"number {i}" for i in np.flatnonzero(present)]
         if names:
             yield f"{fault}: {mujoco.mju_type2Str(kind)} {', '.join(names)}"
-
-
-def _of_joints(model: mujoco.MjModel, of_dofs: np.ndarray) -> np.ndarray:
-    return np.bincount(model.dof_jntid, weights=of_dofs != 0, minlength=model.njnt)

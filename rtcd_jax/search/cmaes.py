@@ -122,7 +122,8 @@ def tell(strategy: Strategy, state: State, points: Float[Array, "P d"], costs: F
     es, params = _evosax(strategy.dimensions, strategy.population)
     costs = jnp.asarray(costs, jnp.float64)
     feasible = jnp.isfinite(costs)
-    penalized = jnp.where(feasible, costs, 0.0) + _weight(costs, feasible) * _outside(points)
+    outside = jnp.sum((points - clip(points)) ** 2, axis=-1)
+    penalized = jnp.where(feasible, costs, 0.0) + _weight(costs, feasible) * outside
     # Failures rank last, those nearer to the box first, so that a search without any feasible point stays about the
     # box. Ranks are ordinal: average ranks of ties would break the recombination weights.
     ranks = jnp.argsort(jnp.lexsort((penalized, ~feasible)))
@@ -174,10 +175,6 @@ def _weight(costs: Float[Array, " P"], feasible: Bool[Array, " P"]) -> Float[Arr
     """gamma = 100 max(1, median f - min f) over the feasible points."""
     known = jnp.where(feasible, costs, jnp.nan)
     return 100.0 * jnp.where(jnp.any(feasible), jnp.maximum(1.0, jnp.nanmedian(known) - jnp.nanmin(known)), 1.0)
-
-
-def _outside(points: Float[Array, "P d"]) -> Float[Array, " P"]:
-    return jnp.sum((points - clip(points)) ** 2, axis=-1)
 
 
 def _finite(evolution: PyTree) -> Bool[Array, ""]:

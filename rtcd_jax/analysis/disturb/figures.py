@@ -99,17 +99,13 @@ def _push_margin(figure: "Figure", record: Mapping[str, Any]) -> None:
 
 
 def _robustness(figure: "Figure", record: Mapping[str, Any]) -> None:
-    perturbations = sorted(record["troubles"], key=_success_of_the_best)
+    # By the best candidate's success: what fails first comes first.
+    perturbations = sorted(record["troubles"], key=lambda each: np.mean(list(each["success"].values())[-1]))
     panels = figure.subplots(len(perturbations), 1, squeeze=False)[:, 0]
     for axes, perturbation in zip(panels, perturbations, strict=True):
         _strip(axes, perturbation)
     scores = ", ".join(f"{name} {criteria['score']:.0%}" for name, criteria in record["summary"].items())
     figure.suptitle(f"share of successes at each level (dark: all), what fails first above; score {scores}", fontsize=9)
-
-
-def _success_of_the_best(perturbation: Mapping[str, Any]) -> float:
-    """By which what fails first comes first."""
-    return float(np.mean(list(perturbation["success"].values())[-1]))
 
 
 def _strip(axes: "Axes", perturbation: Mapping[str, Any]) -> None:

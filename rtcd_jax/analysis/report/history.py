@@ -68,7 +68,8 @@ def searched(config: Config) -> dict[str, tuple[Variable, str]]:
     titles = {f"design.{name}": f"{words(name)} [{unit}]" for name, unit in config.design_units.items()}
     for sign, named in (("q", plant.states), ("r", plant.input_units)):
         for i, (name, unit) in enumerate(named.items()):
-            titles[f"weights.{sign}.{i}"] = f"{sign}{i + 1} of {letter(name)} [1/(s {_squared(unit)})]"
+            squared = f"({unit})²" if "/" in unit or " " in unit else f"{unit}²"
+            titles[f"weights.{sign}.{i}"] = f"{sign}{i + 1} of {letter(name)} [1/(s {squared})]"
     titles |= {f"policy.{name}": title for name, title in OPTIONS.items()}
     return {name: (variable, titles[name]) for name, variable in config.variables().items() if variable.free}
 
@@ -115,7 +116,3 @@ def courses(config: Config, generations: Generations) -> list[Course]:
         for i, (name, (variable, title)) in enumerate(searched(config).items())
         for log_scale in [config.logarithmic(name)]
     ]
-
-
-def _squared(unit: str) -> str:
-    return f"({unit})²" if "/" in unit or " " in unit else f"{unit}²"

@@ -121,7 +121,7 @@ def _header(runs: Sequence[Run]) -> str:
             about += f"{search.generations} generations of {search.population}"
             about += "" if runs[0].generations else ", whose lines are lost"
         cards = "".join(_card(*card) for card in _headlines(runs[0]))
-        candidate = f'<p class="candidate">{_candidate(runs[0])}</p>'
+        candidate = f'<p class="candidate">best: {html.escape(tables.candidate(runs[0]))}</p>'
     else:
         cards = "".join(
             _card(run.name, f"× {_four_digits(_gain(run, 'sum'))}", f"sum over its initial one, {run.best.guarantee}")
@@ -131,10 +131,6 @@ def _header(runs: Sequence[Run]) -> str:
     names = " · ".join(html.escape(run.name) for run in runs)
     head = f'<h1>{names}</h1><p class="about">{html.escape(about)}</p>'
     return f'<header>{head}{candidate}<div class="cards">{cards}</div></header>'
-
-
-def _candidate(run: Run) -> str:
-    return html.escape(f"best: {tables.candidate(run)}")
 
 
 def _headlines(run: Run) -> Iterator[tuple[str, str, str]]:

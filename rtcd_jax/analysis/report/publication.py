@@ -10,7 +10,7 @@ import numpy as np
 from rtcd_jax.analysis.report.reading import Run, compared
 from rtcd_jax.analysis.report.tables import candidate
 from rtcd_jax.analysis.report.words import listed, volume_unit, words
-from rtcd_jax.config.load import Config, differences
+from rtcd_jax.config.load import differences
 from rtcd_jax.elite.elite import Elite
 from rtcd_jax.volume import VOLUMES
 
@@ -70,16 +70,12 @@ def seeds(runs: Sequence[Run]) -> list[list[Run]]:
     """The runs in groups whose configurations are equal but for the seed, in the order of their first ones."""
     groups: list[list[Run]] = []
     for run in runs:
-        alike = [group for group in groups if _equal_but_for_the_seed(group[0].config, run.config)]
+        alike = [group for group in groups if differences(group[0].config, run.config).keys() <= {"search.seed"}]
         if alike:
             alike[0].append(run)
         else:
             groups.append([run])
     return groups
-
-
-def _equal_but_for_the_seed(first: Config, second: Config) -> bool:
-    return differences(first, second).keys() <= {"search.seed"}
 
 
 def _initial(run: Run) -> str:

@@ -52,14 +52,12 @@ def volume_unit(config: Config, volume: str = "sum") -> str:
         powers[above] += 1
         powers.subtract([below] if below else [])
     above, below = (
-        "·".join(name + _power(power) for name, power in signed.items() if power > 0)
+        "·".join(
+            name + ("" if power == 1 else str(power).translate(_POWERS)) for name, power in signed.items() if power > 0
+        )
         for signed in (powers, {name: -power for name, power in powers.items()})
     )
     return f"{above}/{below}" if below else above
-
-
-def _power(power: int) -> str:
-    return "" if power == 1 else str(power).translate(_POWERS)
 
 
 def guarantee(record: Mapping[str, Any]) -> str:
