@@ -12,7 +12,7 @@ import pytest
 import yaml
 
 from rtcd_jax import rollout
-from rtcd_jax.adversary import Drawn, Situation, Worst, scaled_rate
+from rtcd_jax.adversary import Drawn, Situation, Worst, closed_form_rate, scaled_rate
 from rtcd_jax.config import load as configuration
 from rtcd_jax.evaluation import search_budget
 from rtcd_jax.funnel import MARGIN, estimate_funnel
@@ -33,6 +33,9 @@ def uncertainty(residual=0.5, noise=(0.0, 0.0), age=0.0, input_limit=0.0, input=
 # ---- one state: x' = -x + c x^3 + w
 
 
+LIMIT = 10.0
+
+
 @final
 class Scalar(Equations):
     """x' = -x + cubic x^3 + u"""
@@ -47,29 +50,28 @@ class Scalar(Equations):
         return jnp.stack([-x[0] + self.cubic * x[0] ** 3 + u[0]])
 
 
-def scalar_funnel(cubic: float, limit: float, may: Uncertainty):
-    """That of the uncontrolled system at rest, within |x| <= limit."""
+@jax.jit
+def scalar_funnel(cubic: float, may: Uncertainty):
+    """That of the uncontrolled system at rest, within |x| <= LIMIT."""
     data = yaml.safe_load(configuration.EXAMPLE) | {"trajectory": {"knots": 4}}
     plant = Scalar(cubic=cubic)
     problem = Problem(
-        configuration.parse(data), plant, np.zeros(1), np.zeros(1), np.array([limit]), np.ones(1), (), may
+        configuration.parse(data), plant, np.zeros(1), np.zeros(1), np.array([LIMIT]), np.ones(1), (), may
     )  # fmt: skip
     zero = jnp.zeros((), jnp.int32)
     rest = Trajectory(jnp.zeros((3, 1)), jnp.zeros((4, 1)), jnp.asarray(0.1), *jnp.zeros((2,)), zero, zero)
     policy = Policy(rest, jnp.zeros((4, 1, 1)), jnp.ones((4, 1, 1)), zero)
     candidate = Candidate(Nothing(), jnp.ones(1), jnp.ones(1))
-    return jax.jit(partial(estimate_funnel, problem, candidate, policy, budget=search_budget(problem)))(
-        jax.random.key(0)
-    )
+    return estimate_funnel(problem, candidate, policy, jax.random.key(0), search_budget(problem))
 
 
 @pytest.mark.parametrize(("share", "status"), [(1.01, Status.OK), (0.99, Status.FUNNEL_EMPTY)])
 def test_a_disturbance_is_borne_by_what_is_just_large_enough(share, status):
-    """x' = -x + w with |w| <= 0.2 stays in |x| <= r for r > 0.2 alone."""
-    funnel = scalar_funnel(0.0, share * 0.2, uncertainty(residual=0.999, noise=(0.0,), input=0.2))
+    """x' = -x + w with |w| <= r / share stays in |x| <= r for a share above 1 alone."""
+    funnel = scalar_funnel(0.0, uncertainty(residual=0.999, noise=(0.0,), input=LIMIT / share))
     assert funnel.status == status
     if status == Status.OK:
-        np.testing.assert_allclose(np.sqrt(funnel.levels), share * 0.2, rtol=2 * MARGIN)
+        np.testing.assert_allclose(np.sqrt(funnel.levels), LIMIT, rtol=2 * MARGIN)
 
 
 @pytest.mark.parametrize(("residual", "status"), [(0.5, Status.OK), (0.3, Status.FUNNEL_EMPTY)])
@@ -77,7 +79,7 @@ def test_a_region_lies_between_the_roots(residual, status):
     """x' = -x + x^3 + w falls for all |w| <= 0.3 where r - r^3 > 0.3; what is inside the lower root stays there."""
     low, high = sorted(root.real for root in np.roots([-1, 0, 1, -0.3]) if root.real > 0)
     assert 0.3 * high < low < 0.5 * high
-    funnel = scalar_funnel(1.0, 10.0, uncertainty(residual=residual, noise=(0.0,), input=0.3))
+    funnel = scalar_funnel(1.0, uncertainty(residual=residual, noise=(0.0,), input=0.3))
     assert funnel.status == status
     if status == Status.OK:
         np.testing.assert_allclose(np.sqrt(funnel.levels[-1]), high, rtol=5e-3)
@@ -101,23 +103,37 @@ def situation(samples: int) -> Situation:
     return Situation(tuple(jnp.asarray(x)), list(jnp.asarray(error)), *arrays)
 
 
-def growth(at: Situation, rate) -> np.ndarray:
+def growth(at: Situation, rate) -> jax.Array:
     """e'S x'."""
-    return np.einsum("ij,j...,i...->...", np.asarray(at.cost)[..., 0], np.asarray(at.error), np.asarray(rate))
+    return jnp.einsum("ij,j...,i...->...", at.cost[..., 0], jnp.stack(at.error), jnp.stack(rate))
 
 
-def missed(may: Uncertainty) -> np.ndarray:
+def robot():
+    """The paper's pendulum: plant and design."""
+    plant = pipeline.problem().plant
+    return plant, plant.Design(jnp.asarray(0.7), jnp.asarray(0.4))
+
+
+def missed(may: Uncertainty) -> jax.Array:
     """By how much V could rise faster at the worst corner of the box than where the greedy adversary is, relatively."""
-    plant, design = pipeline.problem().plant, pipeline.problem().plant.Design(jnp.asarray(0.7), jnp.asarray(0.4))
-    at = situation(300)
-    x, largest = jnp.stack(at.x), np.full(300, -np.inf)
-    for strength, push, *corner in itertools.product((-1, 1), repeat=len(may.parameters) + 2):
+    return _missed(*robot(), may)
+
+
+@jax.jit
+def _missed(plant, design, may: Uncertainty) -> jax.Array:
+    at, names = situation(300), list(may.parameters)
+    x = jnp.stack(at.x)
+
+    def at_corner(signs):
+        strength, push, *corner = signs
         bounds = at.bounds * (1 + strength * may.input_limit)
         u = jnp.clip(at.asked, -bounds, bounds) + push * may.input
-        widths = may.parameters.items()
-        scales = {name: 1 + sign * width for sign, (name, width) in zip(corner, widths, strict=True)}
-        largest = np.maximum(largest, growth(at, scaled_rate(plant, design, scales, x, u)))
-    return (largest - growth(at, Worst(plant, may).rate(design, at))) / (1 + np.abs(largest))
+        scales = {name: 1 + sign * may.parameters[name] for sign, name in zip(corner, names, strict=True)}
+        return growth(at, scaled_rate(plant, design, scales, x, u))
+
+    corners = jnp.asarray(list(itertools.product((-1.0, 1.0), repeat=len(names) + 2)))
+    largest = jax.vmap(at_corner)(corners).max(0)
+    return (largest - growth(at, Worst(plant, may).rate(design, at))) / (1 + jnp.abs(largest))
 
 
 def test_the_greedy_corner_is_the_worst_where_the_rate_is_affine():
@@ -134,25 +150,34 @@ def test_what_the_greedy_adversary_misses_is_of_second_order():
     assert np.max(half) < 0.35 * np.max(whole)
 
 
+@partial(jax.jit, static_argnames="motion")
+def rate_of(drawn: Drawn, design, at: Situation, motion=closed_form_rate) -> jax.Array:
+    return jnp.stack(drawn._replace(motion=motion).rate(design, at))
+
+
+def drawn(may: Uncertainty, samples: int) -> Drawn:
+    """Without its motion, which is no number."""
+    return Drawn.of(robot()[0], may, jax.random.key(0), samples)._replace(motion=None)
+
+
 def test_no_width_is_the_nominal_loop():
-    plant, design = pipeline.problem().plant, pipeline.problem().plant.Design(jnp.asarray(0.7), jnp.asarray(0.4))
-    at = situation(100)
-    nominal = plant.dynamics(design, jnp.stack(at.x), jnp.clip(at.asked, -at.bounds, at.bounds))
+    (plant, design), at = robot(), situation(100)
+    u = jnp.clip(at.asked, -at.bounds, at.bounds)
+    nominal = jax.jit(plant.dynamics)(design, jnp.stack(at.x), u)
     nothing = BOX.times(0.0)
-    for opponent in (Worst(plant, nothing), Drawn.of(plant, nothing, jax.random.key(0), 100)):
-        np.testing.assert_allclose(jnp.stack(opponent.rate(design, at)), nominal, rtol=1e-14)
+    worst = jax.jit(lambda: jnp.stack(Worst(plant, nothing).rate(design, at)))()
+    for rate in (worst, rate_of(drawn(nothing, 100), design, at)):
+        np.testing.assert_allclose(rate, nominal, rtol=1e-14, atol=1e-14)  # sums of terms of up to 10
 
 
 def test_drawn_robots_move_by_mjx_as_by_their_equations():
     """Each by edits of its own of the MJCF; 1 % off, they do not."""
-    plant, design = pipeline.problem().plant, pipeline.problem().plant.Design(jnp.asarray(0.7), jnp.asarray(0.4))
-    drawn, at = Drawn.of(plant, BOX, jax.random.key(0), 30), situation(30)
-    own = jnp.stack(drawn.rate(design, at))
-    by_mjx = jnp.stack(drawn._replace(motion=rollout.mjx_rate).rate(design, at))
-    np.testing.assert_allclose(by_mjx, own, rtol=1e-9, atol=1e-9)
-    off = drawn.parameters | {"mass": drawn.parameters["mass"] + 0.5}
-    heavier = drawn._replace(motion=rollout.mjx_rate, parameters=off)
-    assert np.max(np.abs(jnp.stack(heavier.rate(design, at)) - own)) > 1e-2
+    robots, at, (_, design) = drawn(BOX, 30), situation(30), robot()
+    own = rate_of(robots, design, at)
+    np.testing.assert_allclose(rate_of(robots, design, at, rollout.mjx_rate), own, rtol=1e-9, atol=1e-9)
+    off = robots.parameters | {"mass": robots.parameters["mass"] + 0.5}
+    heavier = robots._replace(parameters=off)
+    assert np.max(np.abs(rate_of(heavier, design, at, rollout.mjx_rate) - own)) > 1e-2
 
 
 @cache

@@ -30,6 +30,11 @@ def _rk4(f, x, dt):
     return x + dt / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
 
 
+def runge_kutta(robot):
+    """The closed form's step over a batch of designs, states and inputs."""
+    return jax.jit(jax.vmap(lambda design, x, u: _rk4(lambda y: robot.plant.dynamics(design, y, u), x, DT)))
+
+
 def _c_step(model: mujoco.MjModel, x, u, dt: float) -> np.ndarray:
     model.opt.timestep = dt
     data = mujoco.MjData(model)
@@ -64,9 +69,10 @@ def test_a_model_by_name_is_exact_in_any_precision(robot):
 
 def test_c_accelerations_are_the_closed_forms(robot):
     """1e-8 of them: the bodies' own inertia, which MuJoCo wants positive for a point mass, is far below that."""
+    over_states = jax.jit(jax.vmap(robot.plant.dynamics, in_axes=(None, 0, 0)))
     for index in range(3):
         design = robot.design(index)
-        expected = jax.vmap(lambda x, u, design=design: robot.plant.dynamics(design, x, u))(robot.x, robot.u)
+        expected = over_states(design, robot.x, robot.u)
         found = CpuDynamics(robot.recompiled(index), len(robot.x))(np.asarray(robot.x), np.asarray(robot.u))
         np.testing.assert_allclose(found, expected, rtol=1e-8, atol=1e-8)
 
@@ -81,10 +87,7 @@ def test_c_accelerations_of_fewer_states_than_the_capacity(robot):
 
 def test_mjx_step_is_the_closed_forms_runge_kutta_step(robot, mjx_step):
     """Step by step along 100 steps; the tolerance is the bodies' own inertia, as above."""
-    closed_form = jax.jit(
-        jax.vmap(lambda design, x, u: _rk4(lambda y: robot.plant.dynamics(design, y, u), x, DT), in_axes=(0, 0, 0))
-    )
-    x = robot.x
+    closed_form, x = runge_kutta(robot), robot.x
     for _ in range(100):
         ours, theirs = closed_form(robot.designs, x, robot.u), mjx_step(robot.designs, x, robot.u, DT)
         np.testing.assert_allclose(theirs, ours, rtol=1e-8, atol=1e-8)
@@ -127,13 +130,11 @@ def test_mjx_scans_under_strict_promotion_in_the_states_dtype(robot, dtype):
         slopes = jax.jit(jax.vmap(stepper.dynamics))(designs, x0, us)
     assert found.dtype == slopes.dtype == dtype
     tolerance = {jnp.float32: 1e-4, jnp.float64: 1e-9}[dtype]
-    closed_form = jax.vmap(robot.plant.dynamics)(robot.designs, robot.x, robot.u)
+    closed_form = jax.jit(jax.vmap(robot.plant.dynamics))(robot.designs, robot.x, robot.u)
     np.testing.assert_allclose(slopes, closed_form, rtol=tolerance, atol=tolerance)
-    reference = robot.x
+    step, reference = runge_kutta(robot), robot.x
     for _ in range(10):
-        reference = jax.vmap(
-            lambda design, x, u: _rk4(lambda y: robot.plant.dynamics(design, y, u), x, DT), in_axes=(0, 0, 0)
-        )(robot.designs, reference, robot.u)
+        reference = step(robot.designs, reference, robot.u)
     np.testing.assert_allclose(found, reference, rtol=tolerance, atol=tolerance)
 
 
@@ -144,8 +145,8 @@ def test_the_template_belongs_to_no_trace(robot):
     plant = fresh(*jax.tree.leaves(robot.plant))
     arguments = robot.design(0), robot.x[0], robot.u[0]
     with jax.numpy_rank_promotion("raise"), jax.numpy_dtype_promotion("strict"):
-        inside = jax.jit(lambda *a: MjxStepper(plant).dynamics(*a))(*arguments)
-    np.testing.assert_allclose(inside, MjxStepper(plant).dynamics(*arguments), rtol=1e-14)
+        first, second = (jax.jit(lambda *a: MjxStepper(plant).dynamics(*a))(*arguments) for _ in range(2))
+    np.testing.assert_allclose(first, second, rtol=1e-14)
 
 
 MOTOR = '<motor name="torque" joint="theta" gear="1"/>'

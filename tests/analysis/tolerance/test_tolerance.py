@@ -14,7 +14,7 @@ from rtcd_jax.types import Status
 from tests.analysis.report.runs import experiment
 from tests.cli.conftest import finished  # noqa: F401 (a fixture)
 from tests.consoles import Screen
-from tests.test_adversary import scalar_funnel, uncertainty
+from tests.test_adversary import LIMIT, scalar_funnel, uncertainty
 
 BOX = {
     "design": {"mass": 0.02, "length": 0.01}, "plant": {"damping": 0.2}, "input_limit": 0.02, "input": 0.05,
@@ -40,9 +40,9 @@ def test_what_has_no_funnel_even_without_uncertainty_bears_nothing():
 
 
 def test_a_disturbance_is_borne_up_to_the_known_one():
-    """x' = -x + w within |x| <= 0.2 bears |w| <= 0.2, all at once in one program."""
-    box = uncertainty(residual=0.999, noise=(0.0,), input=0.1)
-    estimate = jax.jit(jax.vmap(lambda factor: scalar_funnel(0.0, 0.2, box.times(factor)).status))
+    """x' = -x + w within |x| <= LIMIT bears |w| <= LIMIT, all at once in one program."""
+    box = uncertainty(residual=0.999, noise=(0.0,), input=LIMIT / 2)
+    estimate = jax.jit(jax.vmap(lambda factor: scalar_funnel(0.0, box.times(factor)).status))
     (found,) = largest_factors(lambda factors: np.asarray(estimate(factors)) == Status.OK, np.array([np.inf]), silent)
     assert found == pytest.approx(2, rel=2 * (PRECISE - 1))
 
