@@ -58,8 +58,13 @@ def plot(chart: Chart) -> Plot:
 def _scale(panel: Panel) -> Plot:
     if not panel.logarithmic:
         return {"range": list(panel.window)} if panel.window else {}
-    window = {"range": np.log10(panel.window).tolist(), "dtick": 1} if panel.window else {}
-    return {"type": "log", "exponentformat": "e"} | window
+    scale: Plot = {"type": "log", "exponentformat": "e"}
+    if panel.window:
+        return scale | {"range": np.log10(panel.window).tolist(), "dtick": 1}
+    y = np.concatenate([np.empty(0), *(mark.y for mark in panel.marks if isinstance(mark, Curve))])
+    y = y[np.isfinite(y) & (y > 0)]
+    # Over few decades plotly.js would write all digits from 1 to 9, one over the other: 1, 2 and 5 are enough.
+    return scale | ({"dtick": "D2"} if y.size and y.max() < 30 * y.min() else {})
 
 
 def _traces(mark: Curve | Band | Shares, panel: Panel) -> Iterator[Plot]:

@@ -12,7 +12,15 @@ from rtcd_jax.analysis.report.reading import compared, read_run
 from rtcd_jax.analysis.report.traces import plot
 from rtcd_jax.system.errors import UserError
 from tests.analysis.report import browser
-from tests.analysis.report.runs import candidate, experiment, finished, proved, run_folder, verify_and_disturb
+from tests.analysis.report.runs import (
+    candidate,
+    experiment,
+    finished,
+    generation,
+    proved,
+    run_folder,
+    verify_and_disturb,
+)
 
 
 def written(tmp_path_factory, plants):
@@ -108,6 +116,32 @@ def test_the_slider_draws_each_funnel_s_ellipse_of_its_time(pages, chromium):
     for shown, last in tab.value(moved):
         assert shown == last
     assert tab.value("document.querySelector('.moment output').textContent") == "1.80 s"
+
+
+OVERLAPS = """(() => {
+  const over = [];
+  for (const box of document.querySelectorAll(".plot")) {
+    const labels = [...box.querySelectorAll('g[class^="y"][class$="tick"] text')].map((text) => [text.getBoundingClientRect(), text]);
+    labels.sort((a, b) => a[0].top - b[0].top);
+    for (let i = 1; i < labels.length; i++)
+      if (labels[i][0].top < labels[i - 1][0].bottom - 4)
+        over.push([box.dataset.figure, labels[i - 1][1].textContent, labels[i][1].textContent]);
+  }
+  return over;
+})()"""
+"""Labels of vertical axes of which one lies on another by more than the letters' own margins [pixels]."""
+
+
+@pytest.mark.parametrize("size", [browser.LAPTOP, browser.PHONE], ids=["laptop", "phone"])
+def test_no_label_of_an_axis_lies_on_another(tmp_path, chromium, size):
+    """Where a step size falls by little over a decade, every digit from 1 to 9 would be labelled."""
+    config, elites = experiment(), (candidate(experiment()), candidate(experiment(), 1, 3.0))
+    generations = [generation(k, sigma=0.6 / 1.3**k) for k in range(11)]
+    path = tmp_path / "page.html"
+    path.write_text(render([read_run(run_folder(tmp_path / "run", config, *elites, generations))]))
+    tab = chromium.open(path, size, touch=size == browser.PHONE)
+    assert tab.value("document.querySelectorAll('g[class$=tick] text').length") > 20
+    assert tab.value(OVERLAPS) == []
 
 
 def test_the_page_names_nothing_outside_itself_and_forbids_every_request(pages):
