@@ -75,10 +75,11 @@ def plane_of(
     if motion is not None:
         measured = motion[:, pair]
         window = np.stack([np.minimum(window[0], measured.min(0)), np.maximum(window[1], measured.max(0))])
-    states, task = list(config.plant.states.items()), config.task
-    of_pair = ([values[i] for i in pair] for values in (states, task.state_limits, config.start, task.goal))
-    named, limits, start, goal = of_pair
-    return Plane(named, limits, window, shadows, start, goal)
+    states = list(config.plant.states.items())
+    limits, start, goal = (
+        [values[i] for i in pair] for values in (config.task.state_limits, config.start, config.task.goal)
+    )
+    return Plane([states[i] for i in pair], limits, window, shadows, start, goal)
 
 
 def _shadow(funnel: FunnelView, pair: tuple[int, int], points: int | None) -> Shadow:

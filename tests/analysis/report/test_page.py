@@ -121,7 +121,8 @@ def test_the_slider_draws_each_funnel_s_ellipse_of_its_time(pages, chromium):
 OVERLAPS = """(() => {
   const over = [];
   for (const box of document.querySelectorAll(".plot")) {
-    const labels = [...box.querySelectorAll('g[class^="y"][class$="tick"] text')].map((text) => [text.getBoundingClientRect(), text]);
+    const texts = [...box.querySelectorAll('g[class^="y"][class$="tick"] text')];
+    const labels = texts.map((text) => [text.getBoundingClientRect(), text]);
     labels.sort((a, b) => a[0].top - b[0].top);
     for (let i = 1; i < labels.length; i++)
       if (labels[i][0].top < labels[i - 1][0].bottom - 4)
