@@ -1,6 +1,6 @@
 """Whether a stored certificate proves a stored elite: the one answer that reports and exports give.
 
-It does if the checker accepts the very file, and if the closed loop that the file claims is the elite's: plant,
+It does if the checker accepts the very file, and if the closed loop that the file claims is the elite's: robot,
 parameters, limits, dt, x, u, K, x_goal and K_goal bit by bit, and the rates to within their rounding.
 
 Checking takes seconds. Verdicts are therefore cached in the user's own cache, by the digests of the file and of the
@@ -8,7 +8,9 @@ checker's source. No verdict is read from a run folder, which may come from anyb
 """
 
 import hashlib
+import itertools
 import json
+import math
 import os
 from collections.abc import Callable, Mapping
 from contextlib import suppress
@@ -20,14 +22,18 @@ from typing import Any, Literal, final
 import numpy as np
 
 from rtcd_jax.certificate import check
-from rtcd_jax.certificate.check import Damaged, Node, Refused, Report, Undecided
-from rtcd_jax.certificate.prove.closed_loop import claim_of, claim_of_version_1
+from rtcd_jax.certificate.check import Claim, Damaged, Node, Refused, Report, Undecided
+from rtcd_jax.certificate.prove.closed_loop import claim_of
+from rtcd_jax.certificate.prove.robot import claimed_robot
 from rtcd_jax.elite.elite import Elite
-from rtcd_jax.system.errors import UserError
+from rtcd_jax.system.errors import UserError, printable
 from rtcd_jax.system.files import replace_json
 
 RATE_ROUNDING = 1e-12
 """Share of the largest rate by which another machine's sine may change one."""
+
+FUNCTION_ROUNDING = 1e-12
+"""Share of the largest coefficient by which another derivation may round a function of the robot."""
 
 Verdict = Literal["proved", "missing", "damaged", "of another elite", "refused", "undecided"]
 
@@ -81,7 +87,7 @@ def standing_of(
     try:
         file = check.read_bytes(path)
         content = check.parse(file)
-        check.read_claim(Node("certificate.claim", content["claim"]))
+        claim = check.read_claim(Node("certificate.claim", content["claim"]))
     except OSError as error:
         return Standing("missing", f"{path}: {error.strerror}")
     except Undecided as undecided:
@@ -89,7 +95,7 @@ def standing_of(
     except (Refused, KeyError, TypeError, RecursionError) as error:
         return Standing("damaged", f"{path} is no certificate: {error}")
     try:
-        other = difference(content["claim"], elite)
+        other = difference(content["claim"], claim, elite)
     except UserError as error:
         other = str(error)
     if other:
@@ -98,42 +104,67 @@ def standing_of(
     return _remembered(digest) or _checked(content, digest, progress)
 
 
-def difference(claimed: Mapping[str, Any], elite: Elite) -> str:
-    """The first number of a certificate's claim that is not the stored elite's, with both; empty if there is none.
+def difference(content: Mapping[str, Any], claim: Claim, elite: Elite) -> str:
+    """The first number of a claim that is not the stored elite's, with both; empty if there is none.
 
-    Of a number that is uncertain in the claim, the elite's own must lie between its bounds.
+    `content` is the file's, `claim` what the checker reads in it. Of a number that is uncertain in the claim, the
+    elite's own must lie between its bounds. Mass matrix, potential, dampers and motor are compared as functions.
     """
-    if "plant" in claimed:
-        stored = claim_of_version_1(elite)
-    else:
-        stored = claim_of(elite)
-        if claimed["robot"] != stored["robot"]:
-            return "robot is another there"
-        for key in ("parameters", "limit"):
-            if text := _outside(key, claimed[key], stored[key]):
-                return text
-        stored = {key: stored[key] for key in _OF_THE_LOOP}
+    robot = claimed_robot(elite)
+    for key in ("name", "states", "units", "input_unit", "joints"):
+        theirs, ours = getattr(claim.robot, key), getattr(robot.description, key)
+        if theirs != ours:
+            return f"robot.{key} is {printable(theirs, 80)} there, {printable(ours, 80)} in the elite"
+    numbers = {**elite.parameters, **robot.numbers}
+    for name, ends in claim.parameters.items():
+        if name not in numbers:
+            return f"parameters.{printable(name)} is no number of the elite"
+        if text := _outside(f"parameters.{name}", ends, numbers[name]):
+            return text
+    if text := _outside("limit", claim.limits, robot.limit) or _another(claim.robot, robot.description, numbers):
+        return text
+    stored = claim_of(elite)
     largest = np.max(np.abs([float.fromhex(rate) for rate in np.ravel(stored["rates"])]))
-    for key in sorted(stored, key="rates".__eq__):  # the rates last: they follow from the others
-        text = _difference(key, claimed[key], stored[key], RATE_ROUNDING * largest if key == "rates" else 0.0)
+    for key in _OF_THE_LOOP:
+        text = _difference(key, content[key], stored[key], RATE_ROUNDING * largest if key == "rates" else 0.0)
         if text:
             return text
     return ""
 
 
 _OF_THE_LOOP = ("state_limits", "dt", "x", "u", "K", "x_goal", "K_goal", "rates")
+"""The rates last: they follow from the others."""
 
 
-def _outside(place: str, claimed: Any, stored: Any) -> str:
-    """Ranges beside exact numbers, or objects of them."""
-    if isinstance(stored, dict):
-        pairs = ((f"{place}.{name}", claimed[name], value) for name, value in stored.items())
-        return next(filter(None, (_outside(*pair) for pair in pairs)), "")
-    (low, high), value = map(float.fromhex, claimed), float.fromhex(stored[0])
+def _outside(place: str, ends: tuple[Any, Any], value: float) -> str:
+    low, high = map(float, ends)
     if low <= value <= high:
         return ""
     theirs = f"= {low!r}" if low == high else f"in [{low!r}, {high!r}]"
     return f"{place} {theirs} there, {value!r} in the elite"
+
+
+def _another(theirs: check.Robot, ours: check.Robot, numbers: Mapping[str, float]) -> str:
+    """The first function of the positions that is another than the elite's, beyond rounding."""
+    for key in ("mass", "potential", "damping", "motor"):
+        pair = (_coefficients(getattr(robot, key), numbers) for robot in (theirs, ours))
+        for place, a, b in zip(itertools.count(), *pair, strict=False):
+            largest = max((np.abs(c).max() for c in b.values()), default=0.0)
+            terms = [k for k in {*a, *b} if key != "potential" or any(k)]
+            if any(np.abs(a.get(k, 0.0) - b.get(k, 0.0)).max() > FUNCTION_ROUNDING * largest for k in terms):
+                return f"robot.{key}: function {place} is another there"
+    return ""
+
+
+def _coefficients(functions: Any, numbers: Mapping[str, float]) -> list[dict[tuple[int, ...], Any]]:
+    """Of every function, cosine's and sine's coefficient by the term's joints, for one robot."""
+    if not functions or isinstance(functions[0], check.Term):
+        total: dict[tuple[int, ...], Any] = {}
+        for joints, powers, cosine, sine in functions:
+            factor = math.prod(numbers[name] ** power for name, power in powers)
+            total[joints] = total.get(joints, 0.0) + factor * np.array([float(cosine), float(sine)])
+        return [total]
+    return [each for function in functions for each in _coefficients(function, numbers)]
 
 
 def _difference(place: str, claimed: Any, stored: Any, tolerance: float) -> str:
@@ -145,16 +176,16 @@ def _difference(place: str, claimed: Any, stored: Any, tolerance: float) -> str:
         pairs = [(f"{place}[{i}]", *both) for i, both in enumerate(zip(claimed, stored, strict=True))]
     elif claimed == stored:
         return ""
-    elif place == "plant" or claimed is None or stored is None:
-        return f"{place} is {_shown(place, claimed)} there, {_shown(place, stored)} in the elite"
+    elif claimed is None or stored is None:
+        return f"{place} is {_shown(claimed)} there, {_shown(stored)} in the elite"
     else:
         theirs, ours = float.fromhex(claimed), float.fromhex(stored)
         return "" if abs(theirs - ours) <= tolerance else f"{place} = {theirs!r} there, {ours!r} in the elite"
     return next(filter(None, (_difference(*pair, tolerance) for pair in pairs)), "")
 
 
-def _shown(place: str, value: Any) -> str:
-    return "none" if value is None else repr(value if place == "plant" else float.fromhex(value))
+def _shown(value: str | None) -> str:
+    return "none" if value is None else repr(float.fromhex(value))
 
 
 def _checked(content: Any, digest: str, progress: Callable[[int, int], None]) -> Standing:

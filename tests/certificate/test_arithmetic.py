@@ -5,15 +5,12 @@ import subprocess
 import sys
 from fractions import Fraction
 
-import jax.numpy as jnp
 import mpmath
 import numpy as np
 import pytest
 
 from rtcd_jax.certificate import check
 from rtcd_jax.certificate.check import PI, PI_ERROR, Q, Space, Taylor, polynomial
-from rtcd_jax.certificate.prove.closed_loop import rate
-from tests.plants.robots import packaged
 
 SPACE = Space(2, 4, 5)
 
@@ -183,21 +180,6 @@ def test_cofactors():
         assert float(determinant) == pytest.approx(np.linalg.det(a))
         numbers = np.array([[float(c) for c in row] for row in adjugate])
         np.testing.assert_allclose(numbers, np.linalg.inv(a) * np.linalg.det(a), atol=1e-12)
-
-
-@pytest.mark.parametrize("name", check.PLANTS)
-def test_models_are_the_plants(name):
-    random = np.random.default_rng(3)
-    plant = packaged(name)
-    design = plant.Design(*(jnp.asarray(v) for v in random.uniform(0.2, 0.7, 2)))
-    parameters, model = plant.parameters(design), check.PLANTS[name]
-    robot = model.robot
-    assert (robot.states, robot.units, (robot.input_unit,)) == (plant.state_names, plant.state_units, plant.input_units)
-    assert set(model.parameters) == parameters.keys()
-    assert (parameters[model.limit],) == plant.input_limit
-    x, u = random.normal(size=(plant.n, 100)) * 3, random.normal(size=(1, 100))
-    expected = plant.dynamics(design, jnp.asarray(x), jnp.asarray(u))
-    np.testing.assert_allclose(rate(robot, parameters, x, u[0]), expected, rtol=1e-11, atol=1e-11)
 
 
 def test_the_checker_runs_on_the_standard_library_alone():

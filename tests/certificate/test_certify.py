@@ -148,7 +148,7 @@ def test_another_elite_s_journal_is_not_used(tmp_path):
 
 def test_what_cannot_be_claimed_is_refused():
     arrays, record = swing.elite()
-    with pytest.raises(UserError, match="the checker knows pendulum, cartpole"):
+    with pytest.raises(UserError, match="the elite's parameters lack 'upper_mass'"):
         claim_of(Elite.of(arrays, {**record, "plant": "acrobot"}))
     with pytest.raises(UserError, match=r"u_max = 9\.0: must be torque_limit = 2\.5"):
         claim_of(Elite.of({**arrays, "u_max": np.array([9.0])}, record))

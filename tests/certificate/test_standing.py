@@ -58,7 +58,7 @@ OTHERS = {
     ),
     "a knot": (lambda a, r: a["x"].__setitem__((1, 0), 1.0), "x[1][0] = "),
     "a shorter motion": (lambda a, r: _shorten(a), "x has 5 entries there, 4 in the elite"),
-    "a robot": (lambda a, r: r.update(plant="acrobot"), "no certificate for the plant 'acrobot'"),
+    "a robot": (lambda a, r: r.update(plant="acrobot"), "the elite's parameters lack 'upper_mass'"),
     "a limit of its own": (lambda a, r: a.update(u_max=np.array([3.0])), "u_max = 3.0: must be torque_limit = 2.5"),
 }  # fmt: skip
 

@@ -77,7 +77,17 @@ from rtcd_jax.certificate.check.funnel import Interval, Motion, funnel_obligatio
 from rtcd_jax.certificate.check.goal import GoalField, Shell, goal_field, goal_obligations, goal_speed
 from rtcd_jax.certificate.check.matrix import cofactors
 from rtcd_jax.certificate.check.push import cube, push_clearance, require_push
-from rtcd_jax.certificate.check.robot import HINGE, SLIDE, Equations, Robot, Term, derive, mass_is_definite
+from rtcd_jax.certificate.check.robot import (
+    HINGE,
+    SLIDE,
+    Equations,
+    Function,
+    Robot,
+    Term,
+    derive,
+    mass_is_definite,
+    numbers_of,
+)
 from rtcd_jax.certificate.check.saturation import cases_of, error_under, input_error
 from rtcd_jax.certificate.check.squares import (
     GramCertificate,

@@ -4,7 +4,7 @@ import hashlib
 import json
 import math
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -22,7 +22,17 @@ from rtcd_jax.certificate.check.exact import (
 )
 from rtcd_jax.certificate.check.funnel import Interval
 from rtcd_jax.certificate.check.goal import Shell
-from rtcd_jax.certificate.check.robot import HINGE, SLIDE, Equations, Function, Robot, Term, derive, mass_is_definite
+from rtcd_jax.certificate.check.robot import (
+    HINGE,
+    SLIDE,
+    Equations,
+    Function,
+    Robot,
+    Term,
+    derive,
+    mass_is_definite,
+    numbers_of,
+)
 from rtcd_jax.certificate.check.squares import GramCertificate, monomials
 from rtcd_jax.certificate.check.version1 import PLANTS
 
@@ -126,7 +136,7 @@ def read_claim(node: Node) -> Claim:
     node.require_digests()
     robot = read_robot(entries["robot"])
     parameters = {name: _range(value) for name, value in entries["parameters"].named()}
-    used = {name for function in _functions(robot) for term in function for name, _ in term.powers}
+    used = numbers_of(robot)
     entries["parameters"].require(parameters.keys() == used, f"must be the robot's, {', '.join(sorted(used))[:80]}")
     entries["parameters"].require(
         sum(low < high for low, high in parameters.values()) <= MOST_UNCERTAIN,
@@ -203,11 +213,6 @@ def _range(node: Node) -> tuple[Any, Any]:
     low, high = node.array(2)
     node.require(low <= high, "must rise")
     return low, high
-
-
-def _functions(robot: Robot) -> Iterator[Function]:
-    yield from (entry for row in robot.mass for entry in row)
-    yield from (robot.potential, *robot.damping, *robot.motor)
 
 
 def read_robot(node: Node) -> Robot:

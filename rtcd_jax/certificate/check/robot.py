@@ -53,6 +53,12 @@ class Robot(NamedTuple):
         return tuple(k if joint == HINGE else 0 for k, joint in zip(term.joints, self.joints, strict=True))
 
 
+def numbers_of(robot: Robot) -> set[str]:
+    """The names in it."""
+    rows = (*robot.mass, (robot.potential,), robot.damping, robot.motor)
+    return {name for row in rows for function in row for term in function for name, _ in term.powers}
+
+
 class Equations(NamedTuple):
     """A robot's equations: `christoffel`[i] has the factor of v_j v_k in c_i by (j, k), j <= k. The `waves` are all k
     but zero.

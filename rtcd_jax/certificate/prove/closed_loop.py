@@ -9,6 +9,7 @@ from typing import Any, NamedTuple, final
 import numpy as np
 
 from rtcd_jax.certificate import check
+from rtcd_jax.certificate.prove.robot import ClaimedRobot, claimed_robot
 from rtcd_jax.certificate.prove.uncertainty import Bounds, bounds_of
 from rtcd_jax.config.schema import UncertaintyConfig
 from rtcd_jax.elite.elite import Elite
@@ -43,34 +44,22 @@ def claim_of(elite: Elite, bounds: Bounds | None = None) -> dict[str, Any]:
     of the cubic Hermite interpolant are f(x_k, u_k) and f(x_{k+1}, u_k), rounded to doubles.
 
     Raises:
-        UserError: a plant that the checker does not know, more than one input, knots that are not evenly spaced, or a
-            number that no claim can hold.
+        UserError: a robot of which there is no claim, knots that are not evenly spaced, or a number that no claim can
+            hold.
     """
-    plant, numbers = _plant_of(elite)
+    robot = claimed_robot(elite)
     bounds = bounds or bounds_of(elite, UncertaintyConfig())
     claim = {
-        "robot": robot_record(plant.robot),
-        "parameters": {name: doubles(bounds.parameters[name]) for name in numbers},
+        "robot": robot_record(robot.description),
+        "parameters": {name: doubles(bounds.parameters[name]) for name in robot.numbers},
         "limit": doubles(bounds.limit),
         "disturbance": double(bounds.disturbance),
         "noise": doubles(bounds.noise),
         "age": double(bounds.age),
         "speed": double(0.0),
-        **_loop_record(elite, plant.robot, numbers),
+        **_loop_record(elite, robot),
     }
-    return _readable(claim, {"start": [0, double(0.0)], "push": double(0.0)})
-
-
-def claim_of_version_1(elite: Elite) -> dict[str, Any]:
-    """What a file of version 1 claims about an elite, without `start`. Raises UserError as `claim_of`."""
-    plant, numbers = _plant_of(elite)
-    parameters = {key: double(elite.parameters[key]) for key in plant.parameters}
-    claim = {"plant": elite.plant, "parameters": parameters, **_loop_record(elite, plant.robot, numbers)}
-    return _readable(claim, {"start": [0, double(0.0)]})
-
-
-def _readable(claim: dict[str, Any], rest: dict[str, Any]) -> dict[str, Any]:
-    """The same claim. Raises UserError where the checker's reader refuses it."""
+    rest = {"start": [0, double(0.0)], "push": double(0.0)}
     try:
         check.read_claim(check.Node("the elite's claim", with_digests({**claim, **rest})))
     except check.Refused as refused:
@@ -78,38 +67,15 @@ def _readable(claim: dict[str, Any], rest: dict[str, Any]) -> dict[str, Any]:
     return claim
 
 
-def _plant_of(elite: Elite) -> tuple[check.Plant, dict[str, np.float64]]:
-    """The robot and its numbers but the limit."""
-    name = elite.plant
-    if name not in check.PLANTS:
-        raise UserError(f"no certificate for the plant {name!r}: the checker knows {', '.join(check.PLANTS)}")
-    plant = check.PLANTS[name]
-    if elite.u.shape[1] != 1:
-        raise UserError(f"no certificate for {elite.u.shape[1]} inputs: the checker knows loops with one")
-    missing = [key for key in plant.parameters if key not in elite.parameters]
-    if missing:
-        raise UserError(f"no certificate without the {name}'s {', '.join(missing)}: its parameters lack them")
-    for key in plant.parameters:
-        value = elite.parameters[key]
-        if not (value > 0 or (key in plant.at_least_zero and value == 0)):
-            least = ">= 0" if key in plant.at_least_zero else "> 0"
-            raise UserError(f"the elite's parameters.{key}: = {value:g}: must be {least}")
-    parameters = {key: np.float64(elite.parameters[key]) for key in plant.parameters}
-    limit = parameters.pop(plant.limit)
-    if float(elite.u_max[0]) != limit:
-        raise UserError(f"u_max = {elite.u_max[0]}: must be {plant.limit} = {limit}")
-    return plant, parameters
-
-
-def _loop_record(elite: Elite, robot: check.Robot, numbers: Mapping[str, Any]) -> dict[str, Any]:
-    """What claims of both versions say of the closed loop."""
+def _loop_record(elite: Elite, robot: ClaimedRobot) -> dict[str, Any]:
     x, u = elite.x, elite.u
     dt = elite.time[1] - elite.time[0]
     if not np.allclose(np.diff(elite.time), dt, rtol=1e-9, atol=0):
         raise UserError("no certificate for knots that are not evenly spaced")
     ends = np.stack([x[:-1], x[1:]])
     with np.errstate(all="ignore"):  # the checker's reader refuses what is not finite
-        rates = np.moveaxis(rate(robot, numbers, np.moveaxis(ends, 2, 0), u[:, 0]), 0, 2)
+        numbers = {name: np.float64(value) for name, value in robot.numbers.items()}
+        rates = np.moveaxis(rate(robot.description, numbers, np.moveaxis(ends, 2, 0), u[:, 0]), 0, 2)
     return {
         "state_limits": [double(limit) if np.isfinite(limit) else None for limit in elite.state_limits],
         "dt": double(dt),
