@@ -41,7 +41,7 @@ def test_the_report_names_the_rail(proved):
 
 
 def test_no_motion_leaves_what_is_proved(proved):
-    loop = Simulated(proved, rate=balance.rate)
+    loop = Simulated(proved, rate=lambda x, u, p: balance.rate(x, u, balance.PARAMETERS | p))
     for first in range(len(loop.funnel)):
         levels, at_goal = loop.largest_levels(first, ball(300))
         assert max(levels) <= 1 + ROUNDING
