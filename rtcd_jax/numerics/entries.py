@@ -12,6 +12,8 @@ import jax.numpy as jnp
 from jax.extend.core import Literal, jaxpr_as_fun
 from jaxtyping import PyTree
 
+from rtcd_jax.numerics.loops import on_gpu
+
 Entry = jax.Array | float
 Row = list[Entry]
 Matrix = list[Row]
@@ -36,10 +38,16 @@ def dot(a: Iterable[Entry], b: Iterable[Entry]) -> Entry:
     return plus(*(times(x, y) for x, y in zip(a, b, strict=True)))
 
 
-def held(entries: PyTree) -> PyTree:
-    """The same entries, computed once: the compiler repeats a fused computation wherever its result is used."""
+def held(entries: PyTree, one: jax.Array) -> PyTree:
+    """The same entries, computed once: the compiler repeats a fused computation wherever its result is used.
+
+    Barriers are gone before a CPU's compiler fuses. What it never repeats is an operation that it counts as expensive:
+    there the entries are divided by `one`, an array that is 1 without its knowing.
+    """
     arrays, numbers = eqx.partition(entries, eqx.is_array)
-    return eqx.combine(jax.lax.optimization_barrier(arrays), numbers)
+    if on_gpu():
+        return eqx.combine(jax.lax.optimization_barrier(arrays), numbers)
+    return eqx.combine(jax.tree.map(lambda entry: entry / one, arrays), numbers)
 
 
 def known(f: Callable, *args: PyTree) -> list[float | None]:

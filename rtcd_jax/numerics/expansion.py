@@ -109,7 +109,7 @@ def _forward(f: Differentiated, x, u, h, p):
     place, motion, stages, increments = x, eye[:n], [], []
     for reach in (*REACH[1:], None):
         z, by_z = (*place, *u), motion + eye[n + 1 :]
-        slopes, rates = held((f.slopes(z, p), f.f(z, p)))
+        slopes, rates = held((f.slopes(z, p), f.f(z, p)), jnp.sign(h))
         stages.append((z, slopes, by_z))
         columns = list(zip(*by_z, strict=True))
         increment = [[times(h, dot(row, column)) for column in columns] for row in slopes]
@@ -119,7 +119,6 @@ def _forward(f: Differentiated, x, u, h, p):
         if reach is not None:
             place = [a + reach * h * r for a, r in zip(x, rates, strict=True)]
             motion = _plus(eye[:n], _scaled(increment, reach))
-            place, motion = held((place, motion))
     return _plus(eye[:n], *(_scaled(k, w) for k, w in zip(increments, WEIGHTS, strict=True))), stages
 
 
@@ -131,7 +130,7 @@ def _backward(f: Differentiated, stages, u, h, multipliers, p) -> Matrix:
         mu = tuple(plus(weight * lam, times(reach, r)) for lam, r in zip(multipliers, reached, strict=True))
         pull = [dot(mu, column) for column in zip(*slopes, strict=True)]
         inner = [[times(h, e) for e in row] for row in f.curvature(z, mu, p)]
-        pull, inner = held((pull, inner))
+        pull, inner = held((pull, inner), jnp.sign(h))
         reached = [times(h, e) for e in pull[:n]]
         columns = list(zip(*by_z, strict=True))
         half = [[dot(row, column) for column in columns] for row in inner]

@@ -10,6 +10,7 @@ from rtcd_jax.numerics.entries import Row
 from rtcd_jax.numerics.expansion import Expansion, expander
 from rtcd_jax.numerics.interior_point.iterate import Boxed
 from rtcd_jax.numerics.interior_point.problem import ControlProblem
+from rtcd_jax.numerics.loops import on_gpu
 
 
 class Model:
@@ -62,14 +63,11 @@ class Model:
 
         layout = eqx.filter_eval_shape(one, jax.tree.map(lambda leaf: leaf[0], stages))
         numbers = jax.tree.map(lambda leaf: leaf if isinstance(leaf, float) else None, layout)
-        # One knot after another stays in a core's cache; other devices want all knots at once.
-        arrays = iter(
-            jax.lax.platform_dependent(
-                stages,
-                cpu=lambda stages: jnp.moveaxis(jax.lax.map(packed, stages), 1, 0),
-                default=lambda stages: packed(jax.tree.map(lambda leaf: jnp.moveaxis(leaf, 1, 0), stages)),
-            )
-        )
+        # One knot after another stays in a core's cache; a GPU wants all knots at once.
+        if on_gpu():
+            arrays = iter(packed(jax.tree.map(lambda leaf: jnp.moveaxis(leaf, 1, 0), stages)))
+        else:
+            arrays = iter(jnp.moveaxis(jax.lax.map(packed, stages), 1, 0))
         fill = lambda number: next(arrays) if number is None else number  # noqa: E731
         return jax.tree.map(fill, numbers, is_leaf=lambda leaf: leaf is None)
 
