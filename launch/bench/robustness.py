@@ -3,11 +3,14 @@
 Candidates are uniform in the unit box of the search. Of those with a funnel: the volumes and the push margin, nominal
 and under the configuration's `uncertainty` (zero where there is no funnel), the least volume of a knot, the input that
 the feed-forward leaves, and DIRTREL's l_w (Manchester, Kuindersma, RSS 2017), beside what `rtcd disturb` sees of them.
+
+With `--runs` it tabulates finished runs instead: what each one's best elite bears, by its own record, by `rtcd
+tolerance RUN --uncertainty BOX` and by `rtcd disturb RUN`.
 """
 
 import argparse
 import dataclasses
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -110,13 +113,52 @@ def shown(correlation: float | None) -> str:
     return "-" if correlation is None else f"{correlation:.2f}"
 
 
+COLUMNS = (
+    "sum", "integral", "inlet", "geometric mean", "push margin", "largest factor", "largest push", "pushes recovered",
+    "model", "score",
+)  # fmt: skip
+
+
+def borne(run: Path, name: str) -> dict[str, float | None]:
+    """What a run's records say of its elite `name` ("000" or "initial"), by `COLUMNS`; None where one is missing."""
+    from rtcd_jax.elite.elite import Elite
+    from rtcd_jax.system.files import read_json
+
+    def stored(*path: str) -> dict[str, Any]:
+        file = run.joinpath(*path)
+        return read_json(file, "remove it") if file.is_file() else {}
+
+    elite, who = Elite.read(run, name), "initial" if name == "initial" else "best"
+    whole = stored("tolerance", f"{name}.json").get("rows", [{}])[-1]
+    push, robust = (stored("disturbance", f"{each}.json").get("summary", {}) for each in ("impulse", "robustness"))
+    push, robust = push.get(who, {}), robust.get(who, {})
+    numbers = [elite.volumes.get(each) for each in ("sum", "integral", "inlet", "geometric_mean", "push")]
+    numbers += [whole.get("factor"), push.get("largest_at_all_times"), push.get("recovered")]
+    return dict(zip(COLUMNS, [*numbers, robust.get("model"), robust.get("score")], strict=True))
+
+
+def tabulated(runs: Sequence[str]) -> str:
+    """Markdown, a run a row: `TITLE=RUN` or `RUN`, with `:initial` behind it for the initial candidate."""
+    rows = [["run", *COLUMNS], ["---"] * (len(COLUMNS) + 1)]
+    for each in runs:
+        title, _, path = each.rpartition("=")
+        path, _, name = path.partition(":")
+        row = borne(Path(path), name or "000")
+        rows.append([title or path, *("-" if value is None else f"{value:.3g}" for value in row.values())])
+    return "\n".join(f"| {' | '.join(row)} |" for row in rows)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--config", type=Path, default=CONFIG, help="its box, and its uncertainty")
     parser.add_argument("--candidates", type=int, default=48)
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--results", type=Path, default=RESULTS, help="folder of the JSON file")
+    parser.add_argument("--runs", nargs="+", metavar="[TITLE=]RUN[:initial]", help="finished runs to be tabulated")
     arguments = parser.parse_args()
+    if arguments.runs:
+        print(tabulated(arguments.runs))
+        return
     prepare_jax(1)
     elites, indicators = evaluated(arguments.config, arguments.candidates, arguments.seed)
     borne = int(np.sum(indicators["robust sum"] > 0))

@@ -48,22 +48,22 @@ def arrays_of(problem: Problem, evaluation: Evaluation) -> dict[str, np.ndarray]
 
 def policy_of(arrays: Mapping[str, Any], record: Mapping[str, Any]) -> Policy:
     """The policy that `arrays_of` and `record_of` stored, of a candidate that has a funnel."""
-    ok: Any = np.int32(Status.OK)
-    told = record.get("trajectory", {})
-    numbers: dict[str, Any] = {name: np.asarray(told.get(name, 0)) for name in ("cost", "defect", "iterations")}
-    motion = Trajectory(arrays["u"], arrays["x"], arrays["time"][1] - arrays["time"][0], **numbers, status=ok)
-    return Policy(motion, arrays["K"], arrays["S"], ok, arrays.get("S_rates"))
+    ok, told = jnp.int32(Status.OK), record.get("trajectory", {})
+    us, xs, time, gains, values = (jnp.asarray(arrays[name]) for name in ("u", "x", "time", "K", "S"))
+    cost, defect = (jnp.asarray(told.get(name, 0.0)) for name in ("cost", "defect"))
+    rates, iterations = arrays.get("S_rates"), jnp.asarray(told.get("iterations", 0))
+    motion = Trajectory(us, xs, time[1] - time[0], cost, defect, iterations, ok)
+    return Policy(motion, gains, values, ok, None if rates is None else jnp.asarray(rates))
 
 
 def evaluation_of(problem: Problem, arrays: Mapping[str, Any], record: Mapping[str, Any]) -> Evaluation:
-    """The evaluation that `arrays_of` and `record_of` stored, of a candidate that has a funnel."""
-    ok: Any = np.int32(Status.OK)
+    """The evaluation that `arrays_of` and `record_of` stored, of a candidate that has a funnel; on the host."""
     policy = policy_of(arrays, record)
+    genome, levels, trials = (jnp.asarray(arrays[name]) for name in ("genome", "rho", "trials"))
     borne = None if problem.uncertainty is None else jnp.ones(())
-    funnel = Funnel(policy, arrays["rho"], arrays["trials"], ok, borne)
-    candidate = jax.device_get(decode(problem, jnp.asarray(arrays["genome"])))
-    volumes = jax.device_get(funnel_volume(funnel, input_jumps(problem, candidate, policy.trajectory)))
-    return Evaluation(arrays["genome"], candidate, funnel, volumes, ok)
+    funnel, candidate = Funnel(policy, levels, trials, policy.status, borne), decode(problem, genome)
+    volumes = funnel_volume(funnel, input_jumps(problem, candidate, policy.trajectory))
+    return jax.device_get(Evaluation(genome, candidate, funnel, volumes, policy.status))
 
 
 def record_of(

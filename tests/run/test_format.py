@@ -12,12 +12,13 @@ import scipy.stats
 from rtcd_jax.config.load import config_hash
 from rtcd_jax.elite.elite import Elite
 from rtcd_jax.elite.records import write_elite
-from rtcd_jax.run.format import arrays_of, epsilon, record_of
+from rtcd_jax.run.format import arrays_of, epsilon, evaluation_of, record_of
 from rtcd_jax.run.optimize import summary
 from rtcd_jax.run.reevaluation import Reported
 from rtcd_jax.system.files import plain
 from rtcd_jax.volume import VOLUMES
 from tests import pipeline
+from tests.pipeline import same
 
 KNOTS = 51
 
@@ -34,6 +35,18 @@ def arrays():
 @pytest.fixture(scope="module")
 def record():
     return record_of(pipeline.problem(), _row(pipeline.RTCD))
+
+
+def test_what_is_stored_is_read_back(arrays, record):
+    """Also as the types say it: what goes on with a stored elite is compiled for arrays of JAX's shapes and kinds."""
+    evaluation, rates = _row(pipeline.RTCD), np.ones((KNOTS - 1, 2, 2, 2))
+    again = evaluation_of(pipeline.problem(), {**arrays, "S_rates": rates}, plain(record))
+    motion, stored = again.funnel.policy.trajectory, evaluation.funnel.policy.trajectory
+    for name in ("us", "xs", "cost", "defect", "iterations"):
+        assert same(getattr(motion, name), getattr(stored, name))
+    assert same(again.funnel.policy.value_rates, rates)
+    assert same(again.candidate, evaluation.candidate)
+    np.testing.assert_allclose(list(again.volumes.named.values()), list(evaluation.volumes.named.values()), rtol=1e-12)
 
 
 def test_the_policy_of_the_record_is_the_candidate_s():

@@ -114,7 +114,7 @@ def _teller(boxes: Sequence[Side], console: Console) -> Callable[[np.ndarray, np
 def _program(problem: Problem, elite: Elite) -> Callable[[Uncertainty], tuple[Array, dict[str, Array]]]:
     """Of boxes [B]: whether the elite's policy has a funnel under each, and its volumes there."""
     candidate = _candidate(problem, elite)
-    policy = jax.tree.map(jnp.asarray, policy_of(vars(elite), elite.record))
+    policy = policy_of(vars(elite), elite.record)
     jumps = input_jumps(problem, candidate, policy.trajectory)
     directions = {"directions": problem.config.elites.directions}
 
