@@ -24,6 +24,7 @@ from rtcd_jax.certificate.prove.closed_loop import (
 from rtcd_jax.certificate.prove.robot import claimed_robot
 from rtcd_jax.certificate.prove.uncertainty import bounds_of
 from rtcd_jax.certificate.standing import difference, standing, standing_of
+from rtcd_jax.cli import main as cli
 from rtcd_jax.config.plants import PLANTS, read_plant
 from rtcd_jax.config.schema import UncertaintyConfig
 from rtcd_jax.elite.elite import Elite
@@ -143,6 +144,12 @@ def test_a_spring_on_a_hinge_has_no_claim():
     )
     with pytest.raises(UserError, match="no certificate for a spring on the hinge pole"):
         claim_of(own_elite(sprung, {}, 1.0))
+
+
+def test_more_states_than_proofs_are_for_are_told_in_a_line(tmp_path, capsys):
+    run = folder_with(tmp_path / "run", *upright.elite("double_cartpole", inputs=(0.0,), dt=0.001))
+    assert cli.main(["certify", str(run)]) == 2
+    assert capsys.readouterr().err == "rtcd: no certificate for 6 states: proofs are for 2 and 4\n"
 
 
 # Boxes ----------------------------------------------------------------------------------------------------------------

@@ -20,12 +20,16 @@ from rtcd_jax.cli import main as cli
 from rtcd_jax.elite.elite import Elite
 from tests.certificate import swing
 from tests.certificate.folder import folder_with
+from tests.certificate.loops import Simulated, ball, floats
 from tests.certificate.test_check import nudged, refusal, resealed
 from tests.certificate.test_theorems import anywhere, shown
 
 VERSION_1 = Path(__file__).parent / "files" / "version1.json.gz"
 """Of the elite of `swing.py`, by a checker that knew no other version."""
 MARGIN_THEN, INLET_THEN = 0.8240586116152051, 9.592102479145328
+VERSION_2 = Path(__file__).parent / "files" / "version2_age.json.gz"
+"""Of the last interval of that elite with an age of 0.5 ms, before old measurements counted to first order."""
+MARGIN_OF_2 = 0.04141926240071001
 
 BOX = """
 uncertainty:
@@ -33,13 +37,12 @@ uncertainty:
   input_limit: 0.02
   input: 0.05
   noise: [0.001, 0.002]
-  age: 0.0005
 """
 
 
 @pytest.fixture(scope="module")
 def bearing(tmp_path_factory):
-    """A run folder whose elite is certified under all kinds of uncertainty at once."""
+    """A run folder whose elite is certified under all kinds of uncertainty but old measurements."""
     folder = folder_with(tmp_path_factory.mktemp("bearing"), *swing.elite())
     (folder / "box.yaml").write_text(BOX)
     outcome = certify_elite(folder, "000", "proved", lambda step: None, uncertainty=folder / "box.yaml")
@@ -231,7 +234,6 @@ def test_it_says_what_it_bears(borne):
         "a limit in [2.45, 2.55] N m",
         "every disturbance |w(t)| <= 0.05 N m",
         "theta +-0.001 rad, theta_dot +-0.002 rad/s",
-        "measured at most 0.0005 s ago",
         "comes and stays within theta +-",
         "an impulse of up to",
     ):  # fmt: skip
@@ -284,8 +286,6 @@ LIES = {
     "a weaker motor": (_raise("claim", "limit", 0, factor=0.5), "goal"),
     "a stronger disturbance": (_raise("claim", "disturbance", factor=8.0), "goal"),
     "a worse encoder": (_raise("claim", "noise", 1, factor=200.0), "goal"),
-    "an older measurement": (_raise("claim", "age", factor=30.0), "goal"),
-    "a slower feedback": (_raise("claim", "speed", factor=0.5), "the feedback may change by"),
     "a lower rest": (_raise("goal", "rest", factor=0.5), "goal.shells[0]: starts at"),
     "no rest": (_raise("goal", "rest", to=0.0), "must have a rest > 0"),
     "a larger push": (_raise("claim", "push", factor=1.01), "may leave the funnel"),
@@ -323,6 +323,135 @@ def test_the_push_margin_is_that_of_impulses_at_fine_instants(borne):
     assert 0.99 * least < float(claim.push) <= least
 
 
+# Old measurements -----------------------------------------------------------------------------------------------------
+
+AGE = 0.005
+
+
+@pytest.fixture(scope="module")
+def delayed_text(tmp_path_factory):
+    """A certificate of feedback that is up to 5 ms old."""
+    folder = folder_with(tmp_path_factory.mktemp("delayed"), *swing.elite())
+    (folder / "box.yaml").write_text(f"age: {AGE}")
+    outcome = certify_elite(folder, "000", "proved", lambda step: None, uncertainty=folder / "box.yaml")
+    assert outcome is not None
+    assert outcome.whole
+    return (folder / "certificates" / "000.json").read_text()
+
+
+@pytest.fixture
+def delayed(delayed_text):
+    return json.loads(delayed_text)
+
+
+def test_five_milliseconds_cost_little(delayed, content):
+    """To first order a delay is a known change of the feedback; as an error of its own size it leaves no funnel."""
+    report, without = check.check(delayed), check.check(content)
+    assert "measured at most 0.005 s ago" in check.sentence(report)
+    assert report.volumes["inlet"] > 0.8 * without.volumes["inlet"]
+    claim = report.claim
+    interval = check.read_interval(check.Node("interval", delayed["funnel"][0]), claim)
+    assert float(first_order(claim, interval)[0]) < 0.5 * AGE * float(claim.speed)
+
+
+def first_order(claim, interval):
+    """`lateness` on an interval, and the zeroth order's error."""
+    late = check.input_error(claim, interval.knot)
+    bounds = check.funnel_delay(claim, interval, "interval")
+    jumps = check.jumps_within_reach(claim, interval.knot, interval.start)
+    return check.lateness(claim, late, bounds.misfit, jumps), late
+
+
+def test_a_former_feedback_is_what_the_first_order_says(delayed):
+    """On simulated motions under delays that jump: phi(r) = phi(t) - (t - r) rho e up to `lateness`, where u_lin is not
+    beyond the limits by more than the zeroth order's error."""
+    claim = check.read_claim(check.Node("claim", delayed["claim"]))
+    intervals = [check.read_interval(check.Node("f", each), claim) for each in delayed["funnel"]]
+    loop, dice, step = Simulated(delayed), np.random.default_rng(0), 2.5e-4
+    reach, largest = round(AGE / step), 0.0
+    y = ball(40, 1)
+    x = loop.nominal(0, 0.0)[:, None] + floats(delayed["funnel"][0]["first"]) @ y
+    past = []
+    for interval in intervals:
+        k, begin, end = interval.knot, float(interval.start), float(interval.end)
+        bound, zeroth = map(float, first_order(claim, interval))
+        count = round((end - begin) * loop.dt / step)
+        for i in range(count):
+            fraction = begin + (end - begin) * i / count
+            gain = (1 - fraction) * loop.K[k] + fraction * loop.K[k + 1]
+            error = x - loop.nominal(k, fraction)[:, None]
+            past.append(gain @ error)
+            s = 2 * i / count - 1
+            row = ((1 - s) * floats_of(interval.late[0]) + (1 + s) * floats_of(interval.late[1])) / 2
+            asked = loop.u[k] - past[-1]
+            for back in range(min(reach, len(past) - 1) + 1):
+                off = np.abs(past[-1 - back] - (past[-1] - back * step * (row @ error)))
+                within = np.abs(asked) <= loop.limit + zeroth
+                assert np.all(off[within] <= bound)
+                largest = max(largest, np.max(off[within], initial=0) / bound)
+            held = np.choose(dice.integers(0, min(reach, len(past)), 40), past[-1 : -reach - 2 : -1])
+            u = np.clip(loop.u[k] - held, -loop.limit, loop.limit)
+            x = Simulated.step(lambda z, _, u=u: swing.rate(z, u, loop.parameters), x, 0.0, step)
+    assert 0.02 < largest <= 1
+
+
+def test_bounds_of_delays_bear_on_every_robot_of_a_box(delayed):
+    claim = check.read_claim(check.Node("claim", delayed["claim"]))
+    interval = check.read_interval(check.Node("f", delayed["funnel"][1]), claim)
+    ends = {name: (low * Q(49, 50), low * Q(51, 50)) for name, (low, _) in claim.parameters.items()}
+    among = check.funnel_delay(claim._replace(parameters=ends), interval, "box")
+    for corner in ((0, 0, 0, 0), (1, 0, 1, 0), (0, 1, 0, 1)):
+        exact = {name: (pair[i],) * 2 for i, (name, pair) in zip(corner, ends.items(), strict=True)}
+        of_one = check.funnel_delay(claim._replace(parameters=exact), interval, "robot")
+        assert all(float(a) > 0.999 * float(b) > 0 for a, b in zip(among, of_one, strict=True))
+
+
+def floats_of(row):
+    return np.array([float(each) for each in row])
+
+
+DELAY_LIES = {
+    "an older measurement": (_raise("claim", "age", factor=3.0), "goal"),
+    "a slower feedback": (_raise("claim", "speed", factor=0.5), "the feedback may change by"),
+    "a smoother feedback": (_raise("claim", "jerk", factor=0.5), "the feedback's jerk may be"),
+    "a weaker reaction": (_raise("claim", "reaction", factor=0.5), "the feedback's reaction may be"),
+    "no jump": (_raise("claim", "jumps", 2, factor=0.2), "the feedback's rate may jump by"),
+    "another first order": (_raise("funnel", 1, "late", 0, 1, factor=-1.0), "funnel[1]"),
+    "another first order at the goal": (_raise("goal", "late", 1, factor=-1.0), "goal"),
+}
+
+
+@pytest.mark.parametrize("lie", DELAY_LIES)
+def test_delays_that_are_not_borne_are_refused_with_their_place(delayed, lie):
+    change, reason = DELAY_LIES[lie]
+    change(delayed)
+    assert reason in refusal(resealed(delayed))
+
+
+def test_laws_of_old_measurements_may_not_be_left_out(delayed):
+    for name in [case for case in delayed["funnel"][1]["cases"] if "late" in case]:
+        del delayed["funnel"][1]["cases"][name]
+    assert "funnel[1].cases: must have the cases" in refusal(resealed(delayed))
+
+
+def test_no_delayed_motion_leaves_and_later_ones_do(delayed):
+    def followed(beyond):
+        return summed([Part.of(Motions(delayed, beyond).follow(200, 16, np.random.default_rng(3)))], 16)
+
+    assert followed(1.0).broken == 0
+    assert followed(40.0).not_arrived > 0
+
+
+def test_a_file_whose_old_measurements_count_by_their_speed_alone_is_decided_still():
+    """As files were written first: without `jerk`, a delay is an error of the feedback."""
+    old = json.loads(gzip.decompress(VERSION_2.read_bytes()))
+    report = check.check(old)
+    assert report.margin == pytest.approx(MARGIN_OF_2, rel=1e-7)
+    assert not report.claim.first_order
+    old["claim"]["speed"] = nudged(old["claim"]["speed"], -0.5)
+    assert "the feedback may change by" in refusal(resealed(old))
+
+
 # Configurations -------------------------------------------------------------------------------------------------------
 
 
@@ -358,7 +487,7 @@ def test_what_the_run_bears_is_certified_unless_told_otherwise(tmp_path, monkeyp
 STATEMENT = [
     ("claim", "parameters", "m", 1), ("claim", "parameters", "m", 0), ("claim", "parameters", "l", 1),
     ("claim", "parameters", "b", 1), ("claim", "limit", 0), ("claim", "limit", 1), ("claim", "disturbance"),
-    ("claim", "noise", 0), ("claim", "noise", 1), ("claim", "age"), ("claim", "speed"), ("claim", "push"),
+    ("claim", "noise", 0), ("claim", "noise", 1), ("claim", "push"),
     ("goal", "rest"), ("claim", "robot", "mass", 0, 0, 0, "cos"), ("claim", "robot", "potential", 0, "cos"),
     ("claim", "robot", "motor", 0, 0, "cos"), ("claim", "K_goal", 1), ("claim", "u", 1), ("claim", "dt"),
 ]  # fmt: skip

@@ -10,6 +10,7 @@ folder and nothing else. Read it in this order:
     squares     positive on the sphere: sums of squares, by Bernstein polynomials in the time and in the robot's numbers
     robot       a robot's equations from its mass matrix and potential; det M > 0 for all angles
     claim       the robots and closed loops that a certificate is about
+    delay       feedback of old measurements, to first order
     saturation  what the motor gives, between two saturated laws
     funnel      the obligations of one interval of the funnel
     push        the largest impulse
@@ -26,8 +27,9 @@ every instant; they may vary in time). With D = det M, D x' = a + b (u + w). Its
 
 with any F between its bounds, any measurable |w(t)| <= w_max, and the feedback phi = K(r) (x(r) + e - x*(r)), after t_N
 K_g (x(r) + e - x_g), of a measurement at some time r: not more than `age` before, not before the motion began, not by
-the controller of another phase; with any error |e_i| <= `noise`_i. x* is the cubic Hermite interpolant of the claimed
-states and rates, K linear between K_k and K_{k+1}. If `check` accepts, then with E(t) = {x*(t) + L(t) y : |y| <= 1} and
+the controller of another phase; with any error |e_i| <= `noise`_i. Where the claim has a `jerk`, p is constant in time.
+x* is the cubic Hermite interpolant of the claimed states and rates, K linear between K_k and K_{k+1}. If `check`
+accepts, then with E(t) = {x*(t) + L(t) y : |y| <= 1} and
 G = {x_g + L_g y : |y| <= 1} of the certificate, every motion that is in E(t) at some t of [start, t_N] stays in E until
 t_N, is then in G, never leaves G, and comes and stays as close to x_g as reported; in E and G no state exceeds its
 limit; and x*(t) + M^-1 (motor) J is in E(t) for all t of [start, t_N] and |J| <= `push`.
@@ -36,8 +38,9 @@ PROOF. *Funnel.* In y, d/dt |y|^2 = 2 y'L^-1 (f - x*' - L'y). Let L = L(s), s in
 det L > 0; det M > 0 is shown for all angles and robots (robot.py). Then q = -2 c y' adj(L) (a + b (u + w) -
 D (x*' + L'y)), with a constant c > 0, is -d/dt |y|^2 times a positive function. The feedback differs from K (x - x*) by
 at most `error` = sum_i |K_i| noise_i + age speed, where |d/dt K (x - x*)| <= speed is shown in E. So u + w lies between
-two saturated laws (saturation.py), and since q is affine in it, it is enough that q > 0 for both. On the sphere |y| = 1
-one of three cases holds for each law: it is free, or at the upper, or at the lower limit. For each, q is a polynomial
+two saturated laws (saturation.py), or four where old measurements count to first order (delay.py), and since q is
+affine in it, it is enough that q > 0 for all. On the sphere |y| = 1 one of three cases holds for each law: it is
+free, or at the upper, or at the lower limit. For each, q is a polynomial
 p(s, y, robot) up to a remainder r (sine, cosine and every rounding enclosed). In Bernstein polynomials of the robot's
 numbers it is a mean of its control points, each a polynomial p(s, y), so that it is enough that these are > r; and the
 certificate gives p = sum_j B_j(s) p_j(y) in Bernstein polynomials with, modulo |y|^2 = 1,
@@ -58,6 +61,7 @@ does not rest on them.
 
 from rtcd_jax.certificate.check.claim import Claim
 from rtcd_jax.certificate.check.command import SECONDS, main, within
+from rtcd_jax.certificate.check.delay import jumps_within_reach, lateness
 from rtcd_jax.certificate.check.exact import (
     PI,
     PI_ERROR,
@@ -73,8 +77,18 @@ from rtcd_jax.certificate.check.exact import (
     up,
 )
 from rtcd_jax.certificate.check.file import Node, digest, parse, read_bytes, read_claim, read_goal, read_interval
-from rtcd_jax.certificate.check.funnel import Interval, Motion, funnel_obligations, funnel_speed, motion, require_bounds
-from rtcd_jax.certificate.check.goal import GoalField, Shell, goal_field, goal_obligations, goal_speed
+from rtcd_jax.certificate.check.funnel import (
+    Interval,
+    Motion,
+    funnel_delay,
+    funnel_jump,
+    funnel_obligations,
+    funnel_speed,
+    motion,
+    require_bounds,
+    require_jump,
+)
+from rtcd_jax.certificate.check.goal import GoalField, Shell, goal_delay, goal_field, goal_obligations, goal_speed
 from rtcd_jax.certificate.check.matrix import cofactors
 from rtcd_jax.certificate.check.push import cube, push_clearance, require_push
 from rtcd_jax.certificate.check.robot import (

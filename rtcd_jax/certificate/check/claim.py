@@ -11,8 +11,9 @@ class Claim(NamedTuple):
 
     `parameters` has the least and the largest value of each of the robot's numbers, `limits` of the motor's.
     `disturbance` bounds |w(t)|, `noise` [n] the errors of the measured state, `age` [s] how old a measurement that acts
-    is, `speed` [input/s] how fast the feedback changes. A motion on x* survives an impulse of |J| <= `push` [input s]
-    on the motor.
+    is, `speed` [input/s] how fast the feedback changes. Where old measurements count to first order (delay.py), `jerk`
+    [input/s^2], `reaction` [1/s] and, by knot, `jumps` [input/s] bound how that changes; else `jerk` is None. A motion
+    on x* survives an impulse of |J| <= `push` [input s] on the motor.
     """
 
     equations: Equations
@@ -22,6 +23,9 @@ class Claim(NamedTuple):
     noise: list
     age: Any
     speed: Any
+    jerk: Any
+    reaction: Any
+    jumps: list
     bounds: list
     dt: Any
     x: list
@@ -50,6 +54,11 @@ class Claim(NamedTuple):
     def moves_the_goal(self) -> bool:
         """Whether something acts at the goal that keeps motions from coming to rest there."""
         return self.disturbance != 0 or self.age != 0 or any(noise != 0 for noise in self.noise)
+
+    @property
+    def first_order(self) -> bool:
+        """Whether old measurements count to first order."""
+        return self.jerk is not None
 
     def space(self, s_order: int, y_order: int) -> Space:
         return Space(self.n, s_order, y_order, len(self.uncertain))

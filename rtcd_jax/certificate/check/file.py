@@ -42,7 +42,7 @@ MOST_JOINTS, MOST_TERMS_OF_ROBOT, HIGHEST = 4, 200, 8
 """Of a robot; wave numbers and powers are at most `HIGHEST`."""
 MOST_UNCERTAIN = 6
 """Numbers of a robot."""
-_CASE = re.compile(r"(free|high|low)[-+]?(/[0-9]{1,3}(,[0-9]{1,3})*)?")
+_CASE = re.compile(r"(free|high|low)[-+]?(late)?(/[0-9]{1,3}(,[0-9]{1,3})*)?")
 _DOUBLE = re.compile(r"-?0x[01](\.[0-9a-f]{1,13})?p[+-][0-9]{1,4}")
 
 
@@ -131,7 +131,11 @@ def read_claim(node: Node) -> Claim:
     """A claim of either version: one of version 1 names its robot."""
     if isinstance(node.value, dict) and "plant" in node.value:
         return _read_claim_1(node)
-    names = ("robot", "parameters", "limit", "disturbance", "noise", "age", "speed", *_LOOP, "push")
+    first_order = isinstance(node.value, dict) and "jerk" in node.value
+    names = (
+        *("robot", "parameters", "limit", "disturbance", "noise", "age", "speed", *_LOOP, "push"),
+        *(("jerk", "reaction", "jumps") if first_order else ()),
+    )
     entries: dict[str, Node] = dict(zip(names, node.keys(*names), strict=True))
     node.require_digests()
     robot = read_robot(entries["robot"])
@@ -158,6 +162,11 @@ def read_claim(node: Node) -> Claim:
         age=_at_least_zero(entries["age"]),
         speed=_at_least_zero(entries["speed"]),
         push=_at_least_zero(entries["push"]),
+        jerk=_at_least_zero(entries["jerk"]) if first_order else None,
+        reaction=_at_least_zero(entries["reaction"]) if first_order else None,
+        jumps=[_at_least_zero(each) for each in entries["jumps"].items(len(entries["u"].items()))]
+        if first_order
+        else [],
     )
 
 
@@ -182,7 +191,7 @@ def _read_claim_1(node: Node) -> Claim:
     nothing, noise = Q(0), [Q(0)] * len(plant.robot.states)
     return _claim(
         entries, derive(plant.robot), exact, (limit, limit), disturbance=nothing, noise=noise, age=nothing,
-        speed=nothing, push=nothing,
+        speed=nothing, jerk=None, reaction=None, jumps=[], push=nothing,
     )  # fmt: skip
 
 
@@ -282,8 +291,8 @@ def require_few_terms(node: Node, n: int, s_order: int, y_order: int) -> None:
 
 
 def read_interval(node: Node, claim: Claim) -> Interval:
-    knot, start, end, first, last, bend, orders, cases = node.keys(
-        "knot", "start", "end", "first", "last", "bend", "orders", "cases"
+    knot, start, end, first, last, bend, orders, cases, *late = node.keys(
+        *("knot", "start", "end", "first", "last", "bend", "orders", "cases"), *(("late",) if claim.first_order else ())
     )
     node.require_digests()
     n = claim.n
@@ -291,7 +300,7 @@ def read_interval(node: Node, claim: Claim) -> Interval:
     require_few_terms(orders, n, *pair)
     interval = Interval(
         knot.integer(0, len(claim.u) - 1), start.number(), end.number(), first.array(n, n), last.array(n, n),
-        bend.array(2, n, n), (pair[0], pair[1]), read_cases(cases, n),
+        bend.array(2, n, n), (pair[0], pair[1]), read_cases(cases, n), late[0].array(2, n) if late else [],
     )  # fmt: skip
     node.require(
         0 <= interval.start < interval.end <= 1, "must start before it ends, at fractions of its interval in [0, 1]"
@@ -308,21 +317,25 @@ def _read_shell(node: Node, n: int) -> Shell:
 
 
 class Goal(NamedTuple):
-    """Axes of the goal region, order of its Taylor models, weight of the S-lemma; the shells cover [rest, 1]."""
+    """Axes of the goal region, order of its Taylor models, weight of the S-lemma; the shells cover [rest, 1]. `late` is
+    rho of delay.py where old measurements count to first order.
+    """
 
     axes: list
     order: int
     weight: Any
     rest: Any
     shells: list[Shell]
+    late: list
 
 
 def read_goal(node: Node, claim: Claim) -> Goal:
     """The goal region; that of a file of version 1 has no `rest`, and its shells begin at 0."""
     names = ("axes", "order", "weight", "shells")
     ended = isinstance(node.value, dict) and "rest" in node.value
-    axes, order, weight, items, *others = node.keys(*names, *(("rest",) if ended else ()))
-    rest = others[0].number() if ended else Q(0)
+    others = (*(("rest",) if ended else ()), *(("late",) if claim.first_order else ()))
+    axes, order, weight, items, *more = node.keys(*names, *others)
+    rest = more[0].number() if ended else Q(0)
     shells, reached = [_read_shell(item, claim.n) for item in items.items(at_least=1)], rest
     node.require_digests()
     if claim.moves_the_goal:
@@ -335,7 +348,8 @@ def read_goal(node: Node, claim: Claim) -> Goal:
         reached = shell.end
     items.require(reached == 1, f"ends at {rounded(reached):g}, must end at 1")
     require_few_terms(order, claim.n, MAX_ORDER, order.integer(2, MAX_ORDER - 2))
-    return Goal(axes.array(claim.n, claim.n), order.value, weight.number(), rest, shells)
+    return Goal(axes.array(claim.n, claim.n), order.value, weight.number(), rest, shells,
+                more[-1].array(claim.n) if claim.first_order else [])  # fmt: skip
 
 
 def read_notes(node: Node) -> dict[str, str]:

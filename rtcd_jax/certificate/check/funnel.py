@@ -4,6 +4,16 @@ from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 from rtcd_jax.certificate.check.claim import Claim
+from rtcd_jax.certificate.check.delay import (
+    Along,
+    delay_bounds,
+    jump_bound,
+    jumps_within_reach,
+    lateness,
+    require_delay,
+    scaled_along,
+)
+from rtcd_jax.certificate.check.delay import Bounds as DelayBounds
 from rtcd_jax.certificate.check.exact import Q, alternating, near, require, rounded
 from rtcd_jax.certificate.check.matrix import cofactors, dot
 from rtcd_jax.certificate.check.saturation import Case, cases_of, input_error
@@ -38,6 +48,8 @@ class Interval(NamedTuple):
     bend: list
     orders: tuple[int, int]
     cases: dict[str, GramCertificate]
+    late: list
+    """rho of delay.py at both ends, linear in between, where old measurements count to first order."""
 
 
 def motion(claim: Claim, interval: Interval) -> Motion:
@@ -80,9 +92,18 @@ def funnel_obligations(claim: Claim, interval: Interval, place: str) -> dict[str
     free, forced = pushed(push, relative), pushed(push, field.b)
     linear = dot(data.gain, error) * Q(-1)
     by_axis = [dot(data.gain, column) for column in zip(*data.axes, strict=True)]
-    late = input_error(claim, interval.knot)
+    late, oldest = input_error(claim, interval.knot), None
+    if claim.first_order:
+        row = late_row(space, interval)
+        bounds = delay_bounds(claim, along(claim, data, field, error), late, _models(space, row), place)
+        require_delay(claim, bounds, place)
+        late = lateness(claim, late, bounds.misfit, jumps_within_reach(claim, interval.knot, interval.start))
+        older = [row_i * claim.age - gain for row_i, gain in zip(row, data.gain, strict=True)]
+        by_older = [dot(older, column) for column in zip(*data.axes, strict=True)]
+        oldest = dot(older, error), dot(by_older, by_older)
     obligations = {}
-    for name, case in cases_of(space, claim, late, data.input, linear, dot(by_axis, by_axis), Q(-1), Q(1)).items():
+    squared = dot(by_axis, by_axis)
+    for name, case in cases_of(space, claim, late, data.input, linear, squared, Q(-1), Q(1), oldest).items():
         total = (free + forced * Taylor(free.space, case.input)) * Q(-1)
         obligations |= for_all_robots(name, case, total.p, total.r + total.d, Q(0), WHOLE[0], claim)
     return obligations
@@ -104,11 +125,13 @@ def _without_robot(p, n: int) -> Any:
 
 
 class Field(NamedTuple):
-    """D, a and b of the robots on an ellipsoid, Taylor models."""
+    """D, a and b of the robots on an ellipsoid, Taylor models; the states x, and sine and cosine of k.q by k."""
 
     d: Taylor
     a: list[Taylor]
     b: list[Taylor]
+    x: list[Taylor]
+    waves: dict[tuple[int, ...], tuple[Taylor, Taylor]]
 
 
 def field_of(claim: Claim, x: list[Taylor], values: Mapping[tuple[int, ...], tuple[Any, tuple]], place: str) -> Field:
@@ -119,7 +142,7 @@ def field_of(claim: Claim, x: list[Taylor], values: Mapping[tuple[int, ...], tup
     space = x[0].space
     waves = {k: sine_and_cosine(angle_of(k, x), center, known, place) for k, (center, known) in values.items()}
     d, a, b = claim.equations.field(claim.numbers(space), x, waves)
-    return Field(space.enclose(d), [space.enclose(each) for each in a], [space.enclose(each) for each in b])
+    return Field(space.enclose(d), [space.enclose(each) for each in a], [space.enclose(each) for each in b], x, waves)
 
 
 def angle_of(k: tuple[int, ...], x: list) -> Any:
@@ -159,6 +182,57 @@ def funnel_speed(claim: Claim, interval: Interval, place: str) -> Any:
     rate = [a - field.d * Taylor(space, slow) for a, slow in zip(field.a, data.rate, strict=True)]
     turning = dot([Taylor(space, gain) for gain in data.gain_rate], [Taylor(space, e) for e in error])
     return turning.largest + speed_of(claim, field, [Taylor(space, gain) for gain in data.gain], rate, place)
+
+
+def late_row(space: Any, interval: Interval) -> list:
+    """rho of delay.py as polynomials in s."""
+    return [space.compose([(a + b) / 2, (b - a) / 2], space.s) for a, b in zip(*interval.late, strict=True)]
+
+
+def funnel_delay(claim: Claim, interval: Interval, place: str) -> DelayBounds:
+    """The bounds of delay.py on the ellipsoids of an interval."""
+    data, space = motion(claim, interval), claim.space(*interval.orders)
+    error = [dot(row, [space.y(i) for i in range(claim.n)]) for row in data.axes]
+    x = [Taylor(space, center + e).tidy() for center, e in zip(data.state, error, strict=True)]
+    field = field_of(claim, x, waves_near(claim, x, place), place)
+    late, row = input_error(claim, interval.knot), _models(space, late_row(space, interval))
+    return delay_bounds(claim, along(claim, data, field, error), late, row, place)
+
+
+def along(claim: Claim, data: Motion, field: Field, error: list) -> Along:
+    """The loop on the ellipsoids of an interval, as delay.py needs it."""
+    space = field.d.space
+    speed = 2 / data.duration
+    bend = [space.derivative(rate) * speed for rate in data.rate]
+    e, gain, gain_rate, rate, bent = (
+        _models(space, part) for part in (error, data.gain, data.gain_rate, data.rate, bend)
+    )
+    return scaled_along(field, e, gain, gain_rate, rate, bent, data.input)
+
+
+def _models(space: Any, polynomials: list) -> list[Taylor]:
+    return [Taylor(space, each).tidy() for each in polynomials]
+
+
+def require_jump(claim: Claim, interval: Interval, place: str) -> None:
+    """The jump of the feedback's rate at the knot where an interval begins is not more than the claim's."""
+    if interval.start != 0 or interval.knot == 0:
+        return
+    found, claimed = funnel_jump(claim, interval, place), claim.jumps[interval.knot]
+    unit = claim.robot.input_unit
+    told = f"the feedback's rate may jump by {rounded(found):.6g} {unit}/s, by more than claim.jumps[{interval.knot}]"
+    require(found <= claimed, place, told)
+
+
+def funnel_jump(claim: Claim, interval: Interval, place: str) -> Any:
+    """The bound of the jump at the knot where an interval begins."""
+    space, k = claim.space(*interval.orders), interval.knot
+    error = [dot(row, [space.y(i) for i in range(claim.n)]) for row in interval.first]
+    x = [Taylor(space, space.poly(center) + e).tidy() for center, e in zip(claim.x[k], error, strict=True)]
+    field = field_of(claim, x, waves_near(claim, x, place), place)
+    gain = [Taylor(space, space.poly(each)) for each in claim.K[k]]
+    here = scaled_along(field, _models(space, error), gain, gain, gain, gain, claim.u[k])
+    return jump_bound(claim, here, k, place)
 
 
 def speed_of(claim: Claim, field: Field, gain: list[Taylor], rate: list[Taylor], place: str) -> Any:

@@ -4,6 +4,8 @@ import math
 from typing import Any, NamedTuple
 
 from rtcd_jax.certificate.check.claim import Claim
+from rtcd_jax.certificate.check.delay import Bounds as DelayBounds
+from rtcd_jax.certificate.check.delay import delay_bounds, lateness, require_delay, scaled_along
 from rtcd_jax.certificate.check.exact import MAX_ORDER, PI, PI_ERROR, Q, require, rounded
 from rtcd_jax.certificate.check.funnel import (
     Field,
@@ -33,15 +35,20 @@ class Shell(NamedTuple):
 
 
 class GoalField(NamedTuple):
-    """2 y' adj(L) a / l and 2 y' adj(L) b / l as Taylor models in (l, z) after y = l z, and K L."""
+    """2 y' adj(L) a / l and 2 y' adj(L) b / l as Taylor models in (l, z) after y = l z, K L, and the input's error.
+
+    `older` is the feedback of the oldest measurement as a row, where these count to first order.
+    """
 
     free: Taylor
     forced: Taylor
     gain: list
+    late: Any
+    older: list | None
 
 
-def goal_field(claim: Claim, axes: list, y_order: int, place: str) -> GoalField:
-    """The goal region's, which is {x_g + axes y : |y| <= 1}."""
+def goal_field(claim: Claim, axes: list, y_order: int, place: str, row: list) -> GoalField:
+    """The goal region's, which is {x_g + axes y : |y| <= 1}; `row` is rho of delay.py, if it is needed."""
     adjugate, determinant = cofactors(axes)
     require(determinant > 0, place, "the ellipsoid is degenerate: det L must be > 0")
     if claim.age != 0:
@@ -52,7 +59,23 @@ def goal_field(claim: Claim, axes: list, y_order: int, place: str) -> GoalField:
     require(still, place, "the goal is no equilibrium")
     push = pushes(field, [dot(z, column) for column in zip(*adjugate, strict=True)], determinant)
     gain = [dot(claim.K_goal, column) for column in zip(*axes, strict=True)]
-    return GoalField(pushed(push, field.a), pushed(push, field.b), gain)
+    late, older = error_under(claim, [claim.K_goal]), None
+    if claim.first_order:
+        bounds = goal_delay(claim, axes, y_order, place, row)
+        require_delay(claim, bounds, place)
+        late = lateness(claim, late, bounds.misfit, Q(0))
+        older = [g - claim.age * dot(row, column) for g, column in zip(gain, zip(*axes, strict=True), strict=True)]
+    return GoalField(pushed(push, field.a), pushed(push, field.b), gain, late, older)
+
+
+def goal_delay(claim: Claim, axes: list, y_order: int, place: str, row: list) -> DelayBounds:
+    """The bounds of delay.py in the goal region."""
+    field = _field_at_goal(claim, axes, y_order, place)
+    space = field.d.space
+    error = [Taylor(space, (x.p - space.poly(c))) for x, c in zip(field.x, claim.x_goal, strict=True)]
+    gain, rates, still = ([space.enclose(each) for each in row_] for row_ in (claim.K_goal, row, [Q(0)] * claim.n))
+    here = scaled_along(field, error, gain, still, still, still, Q(0))
+    return delay_bounds(claim, here, error_under(claim, [claim.K_goal]), rates, place)
 
 
 def _field_at_goal(claim: Claim, axes: list, y_order: int, place: str) -> Field:
@@ -83,13 +106,18 @@ def waves_at_goal(claim: Claim, place: str) -> dict[tuple[int, ...], tuple[Any, 
 
 def goal_obligations(claim: Claim, field: GoalField, low, high) -> dict[str, Obligation]:
     """As `funnel_obligations`, in l on [low, high]: q / l where u is saturated or the goal is moved, else q / l^2."""
-    free, forced, gain = field
+    free, forced, gain, late, older = field
     space = free.space
-    linear = dot([space.y(j) for j in range(claim.n)], gain) * Q(-1)
-    bound_squared = space.s * space.s * dot(gain, gain)
+
+    def asked(row: list) -> tuple[Any, Any]:
+        return dot([space.y(j) for j in range(claim.n)], row) * Q(-1), space.s * space.s * dot(row, row)
+
+    (linear, squared), oldest = asked(gain), None
+    if older is not None:
+        linear_then, squared_then = asked(older)
+        oldest = linear_then * space.s, squared_then
     obligations = {}
-    late = error_under(claim, [claim.K_goal])
-    for name, case in cases_of(space, claim, late, Q(0), linear * space.s, bound_squared, low, high).items():
+    for name, case in cases_of(space, claim, late, Q(0), linear * space.s, squared, low, high, oldest).items():
         if case.saturated or claim.moves_the_goal:
             held = free + forced * Taylor(space, case.input)
             p, error, drift = held.p * Q(-1), held.r * high + held.d, Q(0)

@@ -39,11 +39,26 @@ def error_under(claim: Claim, gains: Sequence[Sequence]) -> Any:
     return dot(largest, claim.noise) + claim.age * claim.speed
 
 
-def cases_of(space: Space, claim: Claim, error, feedforward, linear, bound_squared, low, high) -> dict[str, Case]:
+def cases_of(
+    space: Space,
+    claim: Claim,
+    error,
+    feedforward,
+    linear,
+    bound_squared,
+    low,
+    high,
+    oldest: tuple[Any, Any] | None = None,
+) -> dict[str, Case]:
     """By name, for u_lin = feedforward + linear: "free", "high" and "low", each with "-" and "+" where the laws differ.
 
-    |linear|^2 <= bound_squared on the sphere, for s in [low, high]. What cannot occur is left out.
+    |linear|^2 <= bound_squared on the sphere, for s in [low, high]. What cannot occur is left out. `oldest` has both
+    for the oldest measurement, where these count to first order: the cases "late" are those of its laws.
     """
+    if oldest is not None:
+        now = cases_of(space, claim, error, feedforward, linear, bound_squared, low, high)
+        then = cases_of(space, claim, error, feedforward, *oldest, low, high)
+        return now | {f"{name}late": case for name, case in then.items()}
     weak, strong = claim.limits
     w = claim.disturbance
     laws = {"-": (-error, strong, weak, -w), "+": (error, weak, strong, w)}

@@ -18,7 +18,7 @@ from rtcd_jax.certificate.check.file import (
     read_interval,
     read_notes,
 )
-from rtcd_jax.certificate.check.funnel import Interval, funnel_obligations, motion, require_bounds
+from rtcd_jax.certificate.check.funnel import Interval, funnel_obligations, motion, require_bounds, require_jump
 from rtcd_jax.certificate.check.goal import goal_field, goal_obligations, require_arrival
 from rtcd_jax.certificate.check.matrix import cofactors, dot
 from rtcd_jax.certificate.check.push import require_push
@@ -59,6 +59,8 @@ def check_interval(claim: Claim, interval: Interval, place: str):
     require_bounds(claim, motion(claim, interval), place)
     if claim.push != 0:
         require_push(claim, interval, place)
+    if claim.first_order:
+        require_jump(claim, interval, place)
     return min(margins(funnel_obligations(claim, interval, place), interval.cases, f"{place}.cases").values())
 
 
@@ -82,7 +84,7 @@ def check_goal(claim: Claim, node: Node, outlet: list) -> tuple[Goal, list, Any]
         left = None if bound is None else bound - abs(claim.x_goal[i])
         inside = left is None or (left > 0 and left * left > dot(goal.axes[i], goal.axes[i]))
         require(inside, f"{node.place}.axes", f"the limit on |{claim.robot.states[i]}| is not kept")
-    field = goal_field(claim, goal.axes, goal.order, node.place)
+    field = goal_field(claim, goal.axes, goal.order, node.place, goal.late)
     require_arrival(claim, outlet, goal.axes, goal.weight, f"{node.place}.axes")
     least, drift = None, Q(0)
     for i, shell in enumerate(goal.shells):
@@ -215,7 +217,8 @@ def _robots(claim: Claim) -> str:
     name, numbers = printable(claim.robot.name), ", ".join(texts)
     if not claim.uncertain:
         return f"the model {name!r} ({numbers}; SI units)"
-    return f"every robot {name!r} with {numbers} (SI units; constant or varying in time)"
+    in_time = "constant" if claim.first_order else "constant or varying"
+    return f"every robot {name!r} with {numbers} (SI units; {in_time} in time)"
 
 
 def _acts(claim: Claim) -> str:

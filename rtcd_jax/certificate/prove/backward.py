@@ -13,11 +13,9 @@ import numpy as np
 from rtcd_jax.certificate import check
 from rtcd_jax.certificate.check import Claim, GramCertificate, Interval, Obligation, Q, Refused
 from rtcd_jax.certificate.prove import sdp as program
-from rtcd_jax.certificate.prove.closed_loop import Loop
+from rtcd_jax.certificate.prove.closed_loop import Loop, on_grid
 from rtcd_jax.certificate.prove.levels import carried_back, unit_directions
 
-GRID = 34
-"""Ellipsoids are rounded to multiples of 2^-34."""
 DECAY_MARGINS = {2: (0.005, 0.015, 0.04, 0.1), 4: (0.02, 0.06, 0.2, 0.5)}
 """By the number of states: decay margins [1/s] in the order of trial, before an interval is halved."""
 LARGE_DECAY_MARGINS = (0.25, 0.6, 1.5, 4.0, 10.0, 25.0)
@@ -52,11 +50,6 @@ class ProofState(NamedTuple):
     rho: float
     axes: list
     first_trial: int
-
-
-def on_grid(matrix: np.ndarray) -> list[list]:
-    """The exact matrix nearest to `matrix` on the grid."""
-    return [[Q(int(c), 1 << GRID) for c in row] for row in np.rint(matrix * 2.0**GRID)]
 
 
 @final
@@ -111,6 +104,8 @@ class BackwardProof:
         try:
             interval, rho = self._interval(k, start, end, state, decay_margin)
             check.require_bounds(self.claim, check.motion(self.claim, interval), "limits")
+            if self.claim.first_order:
+                check.require_jump(self.claim, interval, "jumps")
             interval, todo, degree = self._models(interval, decay_margin)
             proof = prove(todo, degree, interval.orders[0], self.exact, self._directions, self.solver)
         except Refused:
@@ -133,7 +128,8 @@ class BackwardProof:
         bend = [on_grid((at_end + at_start) / 2), on_grid((at_end - at_start) / 2)]
         fractions = Q(*start.as_integer_ratio()), Q(*end.as_integer_ratio())
         order = TIERS[self.claim.n][0][0]
-        return Interval(k, *fractions, on_grid(a), state.axes, bend, (TIME_ORDER, order), {}), rho
+        late = loop.late_rows(k, start, end) if self.claim.first_order else []
+        return Interval(k, *fractions, on_grid(a), state.axes, bend, (TIME_ORDER, order), {}, late), rho
 
     def _models(self, interval: Interval, decay_margin: float) -> tuple[Interval, dict[str, Obligation], int]:
         """The interval's obligations by the cheapest Taylor models that are good enough."""

@@ -17,7 +17,7 @@ from rtcd_jax.certificate.prove.backward import DECAY_MARGINS, BackwardProof, Pr
 from rtcd_jax.certificate.prove.closed_loop import Loop, claim_of, double, doubles, with_digests
 from rtcd_jax.certificate.prove.goal import GoalRegion, goal_region
 from rtcd_jax.certificate.prove.levels import leveled, unit_directions
-from rtcd_jax.certificate.prove.margins import feedback_speed, push_margin
+from rtcd_jax.certificate.prove.margins import feedback_delay, push_margin
 from rtcd_jax.certificate.prove.sdp import SOLVER
 from rtcd_jax.certificate.prove.uncertainty import bounds_of, uncertainty_of
 from rtcd_jax.certificate.standing import accepted, remember
@@ -82,10 +82,13 @@ def certify_elite(
     elite = Elite.read(run, name)
     bounds, folder = bounds_of(elite, uncertainty_of(elite, uncertainty)), run / "certificates"
     loop_record = claim_of(elite, bounds)
+    misfits: tuple[Any, ...] = ()
     if bounds.age:
-        loop_record["speed"] = double(feedback_speed(_read(loop_record, elite), elite))
+        delay = feedback_delay(_read(loop_record, elite), elite)
+        loop_record |= delay.record()
+        misfits = delay.misfits, delay.misfit_at_goal
     claim = _read(loop_record, elite)
-    loop, exact = Loop(claim, elite), rung == "proved"
+    loop, exact = Loop(claim, elite, *misfits), rung == "proved"
     journal = Journal(
         folder / f".{name}.partial.jsonl",
         {"claim": check.digest(loop_record), "rung": rung, "optimize_value": optimize_value, "solver": solver},
@@ -216,6 +219,7 @@ def _interval_record(interval: check.Interval) -> dict[str, Any]:
             "bend": [_matrix(each) for each in interval.bend],
             "orders": list(interval.orders),
             "cases": _cases_record(interval.cases),
+            **({"late": _matrix(interval.late)} if interval.late else {}),
         }
     )
 
@@ -229,7 +233,8 @@ def _goal_record(region: GoalRegion) -> dict[str, Any]:
         for s in region.shells
     ]
     record = {"axes": _matrix(region.axes), "order": region.order, "weight": double(weight)}
-    return with_digests({**record, "rest": double(region.rest), "shells": shells})
+    late = {"late": [double(c) for c in region.late]} if region.late else {}
+    return with_digests({**record, "rest": double(region.rest), "shells": shells, **late})
 
 
 def _cases_record(cases: Mapping[str, GramCertificate]) -> dict[str, Any]:

@@ -1,6 +1,6 @@
 """The claim of an elite's closed loop, and the same loop in float64 for the search."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from copy import copy
 from functools import lru_cache
 from math import comb
@@ -17,6 +17,8 @@ from rtcd_jax.elite.funnel import value_rates
 from rtcd_jax.numerics.hermite import cubic_hermite, cubic_hermite_rate
 from rtcd_jax.system.errors import UserError
 
+GRID = 34
+"""Ellipsoids are rounded to multiples of 2^-34."""
 ADVERSARIAL_DIRECTIONS, TRIES = 8, 40
 SEARCH_RADII = (0.2, 0.1, 0.05, 0.02)
 """The most adversarial directions of a sphere are improved by random steps: `TRIES` for each standard deviation."""
@@ -207,14 +209,25 @@ class Loop:
     it is `shaped` anew.
     """
 
-    def __init__(self, claim: check.Claim, elite: Elite):
-        self.claim = claim
+    def __init__(self, claim: check.Claim, elite: Elite, misfits: Sequence[float] = (), misfit_at_goal: float = 0.0):
+        self.claim, self.age = claim, float(claim.age)
         self.robot, self.n, self.hinges = claim.robot, claim.n, list(claim.robot.hinges)
         self.parameters = {name: float(low + high) / 2 for name, (low, high) in claim.parameters.items()}
         self.limits, self.disturbance = floats(claim.limits), float(claim.disturbance)
         self.limit, self.dt = float(self.limits.mean()), float(claim.dt)
         self.late = [float(check.input_error(claim, k)) for k in range(len(claim.u))]
         self.late_at_goal = float(check.error_under(claim, [claim.K_goal]))
+        if claim.first_order:
+            self.late = [
+                float(
+                    check.lateness(
+                        claim, check.input_error(claim, k), _exact(misfit), check.jumps_within_reach(claim, k, 0)
+                    )
+                )
+                for k, misfit in enumerate(misfits)
+            ]
+            at_goal = check.error_under(claim, [claim.K_goal])
+            self.late_at_goal = float(check.lateness(claim, at_goal, _exact(misfit_at_goal), check.Q(0)))
         self._points = ControlPoints.of(claim)
         self.x, self.rates, self.u = floats(claim.x), floats(claim.rates), floats(claim.u)
         self.gains, self.goal, self.goal_gain = floats(claim.K), floats(claim.x_goal), floats(claim.K_goal)
@@ -224,7 +237,22 @@ class Loop:
         for k, u in enumerate(self.u):
             for end in (0, 1):
                 a[k, end], b[k, end, :, 0] = linear(self.robot, self.parameters, self.x[k + end], u)
-        self.slopes = value_rates(elite, a, b)
+        self.slopes, self._linear = value_rates(elite, a, b), (a, b)
+
+    def late_row(self, k: int, fraction: float) -> np.ndarray:
+        """rho [n]: how fast K e changes in the unsaturated loop is about rho e."""
+        gain = (1 - fraction) * self.gains[k] + fraction * self.gains[k + 1]
+        a, b = ((1 - fraction) * each[k, 0] + fraction * each[k, 1] for each in self._linear)
+        return (self.gains[k + 1] - self.gains[k]) / self.dt + gain @ (a - b @ gain[None])
+
+    def late_rows(self, k: int, start: float, end: float) -> list[list]:
+        """As certificates have them, at both ends of a part of an interval."""
+        return on_grid(np.array([self.late_row(k, start), self.late_row(k, end)]))
+
+    def goal_late_row(self) -> list:
+        """As `late_rows`, at the goal."""
+        a, b = linear(self.robot, self.parameters, self.goal, 0.0)
+        return on_grid((self.goal_gain @ (a - np.outer(b, self.goal_gain)))[None])[0]
 
     def rate(self, x: np.ndarray, u: Any) -> np.ndarray:
         return rate(self.robot, self.parameters, x, u)
@@ -282,17 +310,21 @@ class Loop:
         def rises(y: np.ndarray) -> np.ndarray:
             error = axes @ y
             asked = self.u[k] - gain @ error
-            worst = self._fastest(center[:, None] + error, s @ error, asked, self.late[k])
+            oldest = asked + self.age * self.late_row(k, fraction) @ error if self.claim.first_order else asked
+            worst = self._fastest(center[:, None] + error, s @ error, (asked, oldest), self.late[k])
             return (2 * (worst - center_rate @ (s @ error)) + np.sum(error * (slope @ error), axis=0)) / rho
 
         return _highest(rises, directions)
 
-    def _fastest(self, x: np.ndarray, weight: np.ndarray, asked: np.ndarray, late: float) -> np.ndarray:
-        """The largest weight'x' [D] of the robots' control points and the inputs about those asked; x [n D]."""
+    def _fastest(
+        self, x: np.ndarray, weight: np.ndarray, asked: tuple[np.ndarray, np.ndarray], late: float
+    ) -> np.ndarray:
+        """The largest weight'x' [D] of the robots' control points and of inputs from one asked to another; x [n D]."""
         determinant, a, b = self._points.field(self.robot, x)
         free, forced = (np.einsum("nd,njd->jd", weight, each) / determinant for each in (a, b))
         (weak, strong), w = self.limits, self.disturbance
-        low, high = np.clip(asked - late, -strong, weak) - w, np.clip(asked + late, -weak, strong) + w
+        least, most = np.minimum(*asked) - late, np.maximum(*asked) + late
+        low, high = np.clip(least, -strong, weak) - w, np.clip(most, -weak, strong) + w
         return np.max(free + np.maximum(forced * low, forced * high), axis=0)
 
     def drift(self, k: int, fraction: float, axes: np.ndarray, y: np.ndarray) -> np.ndarray:
@@ -318,13 +350,24 @@ class Loop:
         """As `growth`, about the goal."""
         s = self.values[-1]
         axes = np.linalg.cholesky(np.linalg.inv(s) * rho)
+        row = floats(self.goal_late_row())
 
         def rises(y: np.ndarray) -> np.ndarray:
             error = axes @ y
             asked = -self.goal_gain @ error
-            return 2 * self._fastest(self.goal[:, None] + error, s @ error, asked, self.late_at_goal) / rho
+            oldest = asked + self.age * row @ error if self.claim.first_order else asked
+            return 2 * self._fastest(self.goal[:, None] + error, s @ error, (asked, oldest), self.late_at_goal) / rho
 
         return _highest(rises, directions)
+
+
+def on_grid(matrix: np.ndarray) -> list[list]:
+    """The exact matrix nearest to `matrix` on the grid."""
+    return [[check.Q(int(c), 1 << GRID) for c in row] for row in np.rint(matrix * 2.0**GRID)]
+
+
+def _exact(value: float) -> Any:
+    return check.Q(*float(value).as_integer_ratio())
 
 
 def _touching(clearance: np.ndarray, s: np.ndarray) -> float:

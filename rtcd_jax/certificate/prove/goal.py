@@ -6,8 +6,8 @@ import numpy as np
 
 from rtcd_jax.certificate import check
 from rtcd_jax.certificate.check import Claim, Q, Refused, Shell
-from rtcd_jax.certificate.prove.backward import on_grid, prove
-from rtcd_jax.certificate.prove.closed_loop import Loop
+from rtcd_jax.certificate.prove.backward import prove
+from rtcd_jax.certificate.prove.closed_loop import Loop, on_grid
 from rtcd_jax.certificate.prove.levels import goal_level, unit_directions
 from rtcd_jax.certificate.prove.sdp import SOLVER
 
@@ -31,6 +31,7 @@ class GoalRegion(NamedTuple):
     rest: float
     shells: list[Shell]
     margin: float
+    late: list
 
 
 def goal_region(claim: Claim, loop: Loop, exact: bool, rest: float = 0.0, solver: str = SOLVER) -> GoalRegion | None:
@@ -57,7 +58,8 @@ def _at_level(
     axes = on_grid(loop.axes(last, 1.0, rho, 0.0)[0])
     degree, waiting, shells, least, rest = (order + 2) // 2, [(0.0, 1.0)], [], np.inf, 0.0
     try:
-        field = check.goal_field(claim, axes, order, "goal")
+        late = loop.goal_late_row() if claim.first_order else []
+        field = check.goal_field(claim, axes, order, "goal", late)
         while waiting:  # from the outside in
             start, end = waiting.pop()
             ends = Q(*start.as_integer_ratio()), Q(*end.as_integer_ratio())
@@ -78,4 +80,4 @@ def _at_level(
                 return None
     except Refused:
         return None
-    return GoalRegion(rho, (1 - OUTLET_CLEARANCE) * rho, axes, order, rest, shells[::-1], least)
+    return GoalRegion(rho, (1 - OUTLET_CLEARANCE) * rho, axes, order, rest, shells[::-1], least, late)

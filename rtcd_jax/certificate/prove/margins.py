@@ -1,13 +1,14 @@
-"""The largest impulse that a funnel survives, and how fast its feedback may change, by the checker's bounds."""
+"""The largest impulse that a funnel survives, and how its feedback may change, by the checker's bounds."""
 
 from collections.abc import Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from rtcd_jax.certificate import check
 from rtcd_jax.certificate.check import Claim, Interval, Q
-from rtcd_jax.certificate.prove.backward import TIERS, TIME_ORDER, on_grid
-from rtcd_jax.certificate.prove.closed_loop import Loop
+from rtcd_jax.certificate.prove.backward import TIERS, TIME_ORDER
+from rtcd_jax.certificate.prove.closed_loop import Loop, doubles, on_grid
 from rtcd_jax.certificate.prove.levels import leveled, unit_directions
 from rtcd_jax.elite.elite import Elite
 
@@ -34,20 +35,49 @@ def push_margin(claim: Claim, intervals: Sequence[Interval]) -> float:
     return low
 
 
-def feedback_speed(claim: Claim, elite: Elite) -> float:
-    """How fast K (x - x*) may change [input/s], in ellipsoids of the levels that samples allow without delay.
+class Delay(NamedTuple):
+    """What a claim says of old measurements: bounds of the feedback's rates; beside it the misfit of each interval and
+    of the goal [input/s], which the search for levels counts with.
+    """
+
+    speed: float
+    jerk: float
+    reaction: float
+    jumps: list[float]
+    misfits: list[float]
+    misfit_at_goal: float
+
+    def record(self) -> dict[str, Any]:
+        """As a claim has it."""
+        numbers = {"speed": self.speed, "jerk": self.jerk, "reaction": self.reaction, "jumps": self.jumps}
+        return {name: doubles(value) for name, value in numbers.items()}
+
+
+def feedback_delay(claim: Claim, elite: Elite) -> Delay:
+    """How fast K (x - x*) and its rate may change, in ellipsoids of the levels that samples allow without delay.
 
     Raises:
         Refused: there are no such levels.
     """
-    claim = claim._replace(age=Q(0))
-    loop = leveled(Loop(claim, elite), unit_directions(claim.n))
+    loop = leveled(Loop(claim._replace(age=Q(0), jerk=None), elite), unit_directions(claim.n))
     orders, zero = (TIME_ORDER, TIERS[claim.n][0][0]), np.zeros((claim.n, claim.n))
-    speeds = []
+    bend = [on_grid(zero), on_grid(zero)]
+    intervals = []
     for k in range(len(claim.u)):
         first, last = (on_grid(loop.axes(k, end, 1.0, 0.0)[0]) for end in (0.0, 1.0))
-        bend = [on_grid(zero), on_grid(zero)]
-        speeds.append(check.funnel_speed(claim, Interval(k, Q(0), Q(1), first, last, bend, orders, {}), "speed"))
-    goal = on_grid(loop.axes(len(claim.u) - 1, 1.0, 1.0, 0.0)[0])
-    speeds.append(check.goal_speed(claim, goal, TIERS[claim.n][0][0], "speed"))
-    return SPEED_CLEARANCE * float(max(speeds))
+        intervals.append(Interval(k, Q(0), Q(1), first, last, bend, orders, {}, loop.late_rows(k, 0.0, 1.0)))
+    axes, order, row = (
+        on_grid(loop.axes(len(claim.u) - 1, 1.0, 1.0, 0.0)[0]),
+        TIERS[claim.n][0][0],
+        loop.goal_late_row(),
+    )
+    speeds = [check.funnel_speed(claim, interval, "speed") for interval in intervals]
+    speed = SPEED_CLEARANCE * float(max(*speeds, check.goal_speed(claim, axes, order, "speed")))
+    claim = claim._replace(speed=Q(*speed.as_integer_ratio()))
+    bounds = [check.funnel_delay(claim, interval, "delay") for interval in intervals]
+    bounds.append(check.goal_delay(claim, axes, order, "delay", row))
+    jerk, reaction = (SPEED_CLEARANCE * float(max(each)) for each in list(zip(*bounds, strict=True))[:2])
+    claim = claim._replace(reaction=Q(*reaction.as_integer_ratio()))
+    jumps = [0.0] + [SPEED_CLEARANCE * float(check.funnel_jump(claim, each, "jump")) for each in intervals[1:]]
+    *misfits, at_goal = (float(each.misfit) for each in bounds)
+    return Delay(speed, jerk, reaction, jumps, misfits, at_goal)

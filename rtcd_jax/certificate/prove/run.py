@@ -10,6 +10,7 @@ from typing import Any, cast
 
 from scipy.stats import spearmanr
 
+from rtcd_jax.certificate.prove.backward import TIERS
 from rtcd_jax.certificate.prove.certify import Outcome, Step, certify_elite
 from rtcd_jax.certificate.prove.closed_loop import claim_of
 from rtcd_jax.certificate.prove.sdp import SOLVER, require_solver
@@ -17,6 +18,7 @@ from rtcd_jax.certificate.prove.uncertainty import bounds_of, uncertainty_of
 from rtcd_jax.elite.elite import Elite
 from rtcd_jax.elite.records import require_elites
 from rtcd_jax.system.console import Clock, Console, Progress, table
+from rtcd_jax.system.errors import UserError
 from rtcd_jax.system.files import make_folder, read_json, replace_json
 from rtcd_jax.system.processes import CONTEXT, processes
 
@@ -50,6 +52,8 @@ def certify_run(
     for name in names:  # at once, and not from a worker
         elite = Elite.read(folder, name)
         claim_of(elite, bounds_of(elite, uncertainty_of(elite, uncertainty)))
+        if (n := len(elite.x_goal)) not in TIERS:
+            raise UserError(f"no certificate for {n} states: proofs are for {' and '.join(map(str, TIERS))}")
     target = folder / "certificates"
     make_folder(target)
     summary = target / "summary.json"
