@@ -236,13 +236,21 @@ def test_options_solve_their_own_riccati_equation(problem, cautious, candidates,
     assert policy.status == Status.OK
     h, s = float(trajectory.dt), np.asarray(policy.values)
     motion = nominal(problem, soft, trajectory)
+
+    @jax.jit
+    def rate(k, share, s, u, weight):
+        x = motion.at(share[None])[:, k, 0]
+        a, b = linearize(problem, soft, x, u[None])
+        a = a + 0.7 * jnp.eye(2)
+        return a.T @ s + s @ a - s @ b @ b.T @ s / weight + jnp.diag(soft.q)
+
     inputs = np.asarray(trajectory.us)[:, 0]
     left = np.maximum(1 - np.abs(inputs) / 2.5, 0.2)
     weights = 0.3 * R[SOFT, 0] / left**2
     assert weights.max() > 5 * weights.min()
     for k in range(0, len(inputs), 7):
         found = solve_ivp(
-            lambda t, v, k=k: _riccati_rate(problem, soft, motion, k, 1 - t / h, v, inputs[k], weights[k]),
+            lambda t, v, k=k: rate(k, np.asarray(1 - t / h), v.reshape(2, 2), inputs[k], weights[k]).ravel(),
             (0, h),
             s[k + 1].ravel(),
             rtol=1e-10,
@@ -266,14 +274,6 @@ def test_a_candidate_s_own_options_go_before_the_configuration_s(problem, cautio
     assert options(searched, chosen) == pytest.approx(OPTIONS)
     other = dataclasses.replace(chosen, policy=chosen.policy | {"discount": jnp.asarray(0.0)})
     assert not np.allclose(jax.jit(partial(stabilize, searched))(other, trajectory).gains, fixed.gains, rtol=1e-2)
-
-
-def _riccati_rate(problem, candidate, motion, k, share, v, u, weight):
-    s = v.reshape(2, 2)
-    x = np.asarray(motion.at(np.array([share])))[:, k, 0]
-    a, b = (np.asarray(each) for each in linearize(problem, candidate, jnp.asarray(x), jnp.asarray([u])))
-    a = a + 0.7 * np.eye(2)
-    return (a.T @ s + s @ a - s @ b @ b.T @ s / weight + np.diag(candidate.q)).ravel()
 
 
 def test_the_goal_s_lqr_is_discounted_too(problem, cautious, candidates):

@@ -32,6 +32,7 @@ def _random_funnel(n: int, knots: int = 7, **changes) -> Funnel:
     return _funnel(roots @ np.swapaxes(roots, 1, 2) + np.eye(n), random.uniform(0.1, 5, knots), **changes)
 
 
+@jax.jit
 def _volumes(funnel: Funnel) -> Volumes:
     """Those where a unit impulse moves the last state by one."""
     knots, n = funnel.policy.trajectory.xs.shape

@@ -151,7 +151,7 @@ def optimize(options: OptimizeOptions, console: Console) -> Exit:
 
         worked = run_optimize(config, options.run, console, cluster)
         finish = partial(_finish_page, options.run, worked, console)
-        cluster.on_first(partial(cluster.heeding, finish))
+        cluster.on_first(partial(cluster.interruptible, finish))
 
     return on_cluster(options.machines, options.run, console, search)
 
@@ -240,7 +240,7 @@ def sweep(options: SweepOptions, console: Console) -> Exit:
             try:
                 worked = run_optimize(case.config, case.folder, console, cluster)
                 finish = partial(_finish_page, case.folder, worked, console)
-                cluster.on_first(partial(cluster.heeding, finish))
+                cluster.on_first(partial(cluster.interruptible, finish))
             except UserError as error:  # the others may do better
                 console.message(f"case {case.number} ended early: {error}")
                 failed.append(case.folder.name)

@@ -102,7 +102,7 @@ def readme(bundle: Bundle, described: dict[str, Any]) -> str:
         quantities="\n".join(rows),
         duration=f"{bundle.elite.time[-1]:.6g}",
         rate=bundle.control_rate.sentence,
-        rung=funnel["rung"],
+        guarantee=funnel["rung"],
         promise=_promise(bundle, funnel),
         columns="`time,pos,vel,torque`" if bundle.elite.x_goal.size == 2 else "`time,pos1,…,vel1,…,tau1,…,K11,…`",
     )

@@ -69,7 +69,7 @@ def optimize(config: Config, folder: Path, console: Console, cluster: Cluster) -
         state, pace = begun, _Pace(config)
         try:
             steps = search.run(plan, evaluate, begun, best)
-            for state, generation in iter(partial(cluster.heeding, partial(next, steps, None)), None):
+            for state, generation in iter(partial(cluster.interruptible, partial(next, steps, None)), None):
                 run.append(vars(generation))
                 run.save_if_due(state, int(state.generation))
                 console.progress(pace.progress(generation))
@@ -80,7 +80,7 @@ def optimize(config: Config, folder: Path, console: Console, cluster: Cluster) -
         run.save(state, int(state.generation))
         if int(state.generation) < config.search.generations:
             console.message(f"no gain of {search.GAIN:.1%} in {config.search.patience} generations: the search is over")
-        initial = cluster.heeding(partial(_initial, problem, evaluate))
+        initial = cluster.interruptible(partial(_initial, problem, evaluate))
         *sampled, initial = again.sample([*_filled(state.elites), initial])
         best_first = _filled(search.finish(plan, state, _stacked(sampled, state.elites)))
         if not best_first:

@@ -100,14 +100,14 @@ class Reevaluation:
             comparisons[k] = comparison
         return comparisons
 
-    def heed(self) -> None:
+    def raise_if_preempted(self) -> None:
         """Raises Preempted if the run was asked to stop; all processes call it alike."""
         self._checks += 1
         self._cluster.raise_if_preempted(self._checks)
 
     def _tell(self, what: str, count: int) -> Callable[[int], None]:
         def tell(done: int) -> None:
-            self.heed()
+            self.raise_if_preempted()
             if done:
                 self._console.message(f"{what}: {done} of {count}")
 
@@ -176,7 +176,7 @@ class _OnDevices(Generic[Result]):
             tell(len(results))
             batch = [*jobs[len(results) : len(results) + devices]]
             filled = batch + batch[-1:] * (devices - len(batch))
-            rows = self._cluster.heeding(partial(self._rows, self._split(filled)))
+            rows = self._cluster.interruptible(partial(self._rows, self._split(filled)))
             results += [row(rows, k) for k in range(len(batch))]
         tell(len(results))
         return results

@@ -147,7 +147,7 @@ def _refined(
     for index in range(done, total):
         states, estimates = jax.block_until_ready(step(starts, states, index))
         partial_state.save_if_due(states, index + 1)
-        again.heed()
+        again.raise_if_preempted()
         if (index + 1) % -(-total // LINES) == 0:
             uncertain = refinement.problem.uncertainty is not None
             borne = f"  under {float(np.min(estimates.box)):4.0%} of the uncertainty" if uncertain else ""

@@ -124,14 +124,14 @@ class Cluster:
         Raises:
             UserError: on every process, if `act` raised it on process 0.
         """
-        value = trouble = None
+        value = failure = None
         if self.first:
             try:
                 value = act()
             except UserError as error:
-                trouble = error
-        if self.agreed(np.asarray(trouble is not None)):
-            raise trouble or UserError("stopped with process 0, which says why")
+                failure = error
+        if self.agreed(np.asarray(failure is not None)):
+            raise failure or UserError("stopped with process 0, which says why")
         return value
 
     def require_alike(self, what: str, mark: str) -> None:
@@ -189,7 +189,7 @@ class Cluster:
         if self._asked or together:
             raise Preempted
 
-    def heeding(self, work: Callable[[], Value]) -> Value:
+    def interruptible(self, work: Callable[[], Value]) -> Value:
         """What `work` returns, done by a thread of its own: that may be inside XLA for minutes.
 
         A process alone that is asked to stop meanwhile raises Preempted at once; what `work` still does is lost.

@@ -78,12 +78,12 @@ def _summary(comparison: Comparison, records: Mapping[str, Mapping[str, Any]]) -
     yield f"{'pushes':30}{heading}"
     yield f"{'  recovered':30}" + "".join(f"{push[name]['recovered']:12.1%}" for name in comparison.names)
     unit = f"[{comparison.plant.input_units[0]} s]"
-    for what, told, key in (
+    for what, summary, key in (
         ("all tolerated up to", push, "largest_at_all_times"),
         ("sudden ones up to", sudden, "tolerated_at_all_times"),
         ("inside the funnel", sudden, "push_margin"),
     ):
-        yield f"{f'  {what} {unit}':30}" + "".join(f"{told[name][key]:12.3g}" for name in comparison.names)
+        yield f"{f'  {what} {unit}':30}" + "".join(f"{summary[name][key]:12.3g}" for name in comparison.names)
     yield f"{'robustness':30}{heading}"
     for criterion in robust[comparison.names[0]]:
         shares = "".join(f"{robust[name][criterion]:12.1%}" for name in comparison.names)

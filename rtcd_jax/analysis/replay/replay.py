@@ -1,6 +1,6 @@
 """`rtcd replay`: was a measured motion inside the funnel? V/rho of every sample, and how much of the motion they cover.
 
-A stretch between two samples is covered if it is no longer than the nominal's interval at that time: nobody knows what
+What lies between two samples is covered if it is no longer than the nominal's interval at that time: nobody knows what
 happened in a longer one.
 """
 

@@ -24,7 +24,7 @@ __all__ = ["ControlProblem", "Guess", "Settings", "Solution", "solve"]
 CACHE = 2**20
 """Second-level cache of a CPU's core [bytes]."""
 MOST = 32
-"""Lanes of a CPU at most: beyond, stragglers cost more than calls."""
+"""Lanes of a CPU at most: of more, waiting for the slowest costs more than calls."""
 VECTOR = 8
 """Lanes come in whole vectors: of the rest of a vector, a compiler may round sines and logarithms differently."""
 

@@ -18,10 +18,10 @@ def _few_states():
 @pytest.fixture(scope="session", params=list(ELITES))
 def robots(request, tmp_path_factory):
     """Two loops of one robot."""
-    return comparison(tmp_path_factory.mktemp("contest") / "run", request.param)
+    return comparison(tmp_path_factory.mktemp("comparison") / "run", request.param)
 
 
 @pytest.fixture(scope="session")
 def pendulums(tmp_path_factory):
     """Two loops of the pendulum."""
-    return comparison(tmp_path_factory.mktemp("contest") / "run", "pendulum")
+    return comparison(tmp_path_factory.mktemp("comparison") / "run", "pendulum")

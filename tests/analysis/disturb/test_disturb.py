@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from rtcd_jax.analysis import disturb
-from rtcd_jax.analysis.disturb import comparison as contests
+from rtcd_jax.analysis.disturb import comparison as comparing
 from rtcd_jax.analysis.disturb import disturb_run, experiments
 from rtcd_jax.analysis.disturb.comparison import Meter, motions, read_comparison, run
 from rtcd_jax.analysis.disturb.experiments import SCORED
@@ -27,7 +27,7 @@ NAMES = ("off_nominal", "impulse", "push_margin", "robustness")
 SMALL = {
     experiments: {"FACTORS": (1, 4), "TIMES": 5, "SIZES": 7, "KICKS": 4, "LEVELS": 5, "REPEATS": 2, "PROFILES": 6},
     disturb: {"FACTORS": (1, 4), "TIMES": 5, "SIZES": 7, "KICKS": 4},
-    contests: {"BATCH": 256, "REPORTED": 0.0},
+    comparing: {"BATCH": 256, "REPORTED": 0.0},
 }
 
 
@@ -156,7 +156,7 @@ def test_a_run_without_elites_is_refused(tmp_path):
 
 
 def test_progress_on_a_terminal_says_what_is_left(monkeypatch):
-    monkeypatch.setattr(contests, "REPORTED", 0.0)
+    monkeypatch.setattr(comparing, "REPORTED", 0.0)
     screen = Screen()
     with screen.console as console:
         meter = Meter(console, 1000)
