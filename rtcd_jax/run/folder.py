@@ -10,13 +10,14 @@ JAX are imported where states are kept.
 """
 
 import contextlib
+import dataclasses
 import fcntl
 import itertools
 import json
 import os
 import socket
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, Self, TypeVar, cast, final
@@ -370,30 +371,61 @@ def _load(checkpointer: Any, checkpoint: Any, state: State) -> State:
     try:
         return load(state)
     except kinds as error:
-        with contextlib.suppress(*kinds):
-            return _with_later_volumes(load(_without_later_volumes(state)))
+        for lacking in (LATER[1:], LATER):
+            with contextlib.suppress(*kinds):
+                return _completed(load(_former(state, lacking)), state)
         raise UserError(
             f"{checkpoint.path} is no state of this search: it is damaged, or another version or precision wrote it; "
             "go on with what provenance.json names, or choose another folder"
         ) from error
 
 
-def _without_later_volumes(state: State) -> State:
-    """As states were before there was a push margin."""
-    return _volumes_mapped(lambda named: {name: v for name, v in named.items() if name not in LATER}, state)
+_STATUSES = 5
+"""How many there were before the last of `LATER`."""
 
 
-def _with_later_volumes(state: State) -> State:
-    """The inverse, with NaN: the elites are evaluated again at a search's end."""
-    return _volumes_mapped(lambda named: named | dict.fromkeys(LATER, named["sum"] * np.nan), state)
-
-
-def _volumes_mapped(change: Callable[[dict[str, Any]], dict[str, Any]], state: State) -> State:
-    import jax
-
+def _former(state: State, lacking: Sequence[str]) -> State:
+    """As states were before there were these volumes."""
+    from rtcd_jax.search.search import SearchState
     from rtcd_jax.types import Volumes
 
-    def mapped(part: Any) -> Any:
-        return Volumes(part.per_knot, change(part.named)) if isinstance(part, Volumes) else part
+    def former(part: Any) -> Any:
+        if isinstance(part, SearchState):
+            return dataclasses.replace(part, elites=mapped(part.elites), counts=part.counts[:_STATUSES])
+        if isinstance(part, Volumes):
+            return Volumes(part.per_knot, {name: v for name, v in part.named.items() if name not in lacking})
+        return part
 
-    return jax.tree.map(mapped, state, is_leaf=lambda part: isinstance(part, Volumes))
+    mapped = partial(_parts_mapped, former)
+    return mapped(state)
+
+
+def _completed(state: State, now: State) -> State:
+    """With all that `now` has: NaN for volumes, since the elites are evaluated again at a search's end."""
+    import jax.numpy as jnp
+
+    from rtcd_jax.search.search import SearchState
+    from rtcd_jax.types import Volumes
+
+    def completed(part: Any, now: Any) -> Any:
+        if isinstance(now, SearchState):
+            counts = jnp.pad(part.counts, (0, len(now.counts) - len(part.counts)))
+            return dataclasses.replace(part, elites=mapped(part.elites, now.elites), counts=counts)
+        if isinstance(now, Volumes):
+            return Volumes(
+                part.per_knot, {name: part.named.get(name, part.named["sum"] * np.nan) for name in now.named}
+            )
+        return part
+
+    mapped = partial(_parts_mapped, completed)
+    return mapped(state, now)
+
+
+def _parts_mapped(change: Callable[..., Any], *states: Any) -> Any:
+    """`change` of a search's state, of the volumes in it, or of a leaf."""
+    import jax
+
+    from rtcd_jax.search.search import SearchState
+    from rtcd_jax.types import Volumes
+
+    return jax.tree.map(change, *states, is_leaf=lambda part: isinstance(part, SearchState | Volumes))

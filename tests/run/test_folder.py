@@ -1,3 +1,4 @@
+import dataclasses
 import errno
 import fcntl
 import json
@@ -187,26 +188,32 @@ def test_a_saved_state_is_restored_bit_by_bit_with_its_types(tmp_path):
         assert np.asarray(old).tobytes() == np.asarray(new).tobytes()
 
 
-def test_a_state_of_an_older_version_that_knew_no_push_margin_goes_on(tmp_path):
+@pytest.mark.parametrize("lacking", [{"goal"}, {"push", "goal"}])
+def test_a_state_of_an_older_version_goes_on(tmp_path, lacking):
+    """It knew fewer volumes, and one status less."""
+
     def older(part):
-        named = {name: volume for name, volume in part.named.items() if name != "push"}
-        return Volumes(part.per_knot, named)
+        return Volumes(part.per_knot, {name: volume for name, volume in part.named.items() if name not in lacking})
 
     is_volumes = lambda part: isinstance(part, Volumes)  # noqa: E731
     config = experiment()
     plan = plan_of(config)
     (state, _), *_ = search.run(plan, bowl, begin(plan))
+    former = jax.tree.map(lambda part: older(part) if is_volumes(part) else part, state, is_leaf=is_volumes)
     with RunFolder.open(tmp_path / "run", config) as folder:
         folder.append({"index": 0})
-        folder.save(jax.tree.map(lambda part: older(part) if is_volumes(part) else part, state, is_leaf=is_volumes), 1)
+        folder.save(dataclasses.replace(former, counts=former.counts[:5]), 1)
     with RunFolder.open(tmp_path / "run", config) as folder:
         restored = folder.restore(begin(plan))
     assert jax.tree.structure(restored) == jax.tree.structure(state)
-    assert np.all(np.isnan(restored.elites.evaluation.volumes["push"]))
-    for name in ("sum", "inlet"):
-        old, new = (each.elites.evaluation.volumes[name] for each in (state, restored))
-        np.testing.assert_array_equal(old, new)
+    for old, new in zip(jax.tree.leaves(state), jax.tree.leaves(restored), strict=True):
+        assert (old.dtype, old.shape) == (new.dtype, new.shape)
+    for name, volumes in restored.elites.evaluation.volumes.named.items():
+        np.testing.assert_array_equal(
+            volumes, state.elites.evaluation.volumes[name] * (np.nan if name in lacking else 1)
+        )
     np.testing.assert_array_equal(state.elites.costs, restored.elites.costs)
+    np.testing.assert_array_equal(state.counts, restored.counts)
 
 
 def test_only_the_latest_states_are_kept_and_saving_one_twice_is_harmless(tmp_path):
