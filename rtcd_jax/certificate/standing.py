@@ -12,7 +12,7 @@ import itertools
 import json
 import math
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field
 from functools import cache
@@ -24,7 +24,7 @@ import numpy as np
 from rtcd_jax.certificate import check
 from rtcd_jax.certificate.check import Claim, Damaged, Node, Refused, Report, Undecided
 from rtcd_jax.certificate.prove.closed_loop import claim_of
-from rtcd_jax.certificate.prove.robot import claimed_robot
+from rtcd_jax.certificate.prove.robot import ClaimedRobot, claimed_robot
 from rtcd_jax.elite.elite import Elite
 from rtcd_jax.system.errors import UserError, printable
 from rtcd_jax.system.files import replace_json
@@ -34,6 +34,9 @@ RATE_ROUNDING = 1e-12
 
 FUNCTION_ROUNDING = 1e-12
 """Share of the largest coefficient by which another derivation may round a function of the robot."""
+
+ROBOTS = 8
+"""Of a box, by which functions of its numbers are told apart: two that differ are equal almost nowhere."""
 
 Verdict = Literal["proved", "missing", "damaged", "of another elite", "refused", "undecided"]
 
@@ -108,21 +111,24 @@ def difference(content: Mapping[str, Any], claim: Claim, elite: Elite) -> str:
     """The first number of a claim that is not the stored elite's, with both; empty if there is none.
 
     `content` is the file's, `claim` what the checker reads in it. Of a number that is uncertain in the claim, the
-    elite's own must lie between its bounds. Mass matrix, potential, dampers and motor are compared as functions.
+    elite's own must lie between its bounds. Mass matrix, potential, dampers and motor are compared as functions of the
+    positions, of the elite's robot and of others of the claim's box.
     """
     robot = claimed_robot(elite)
     for key in ("name", "states", "units", "input_unit", "joints"):
         theirs, ours = getattr(claim.robot, key), getattr(robot.description, key)
         if theirs != ours:
             return f"robot.{key} is {printable(theirs, 80)} there, {printable(ours, 80)} in the elite"
-    numbers = {**elite.parameters, **robot.numbers}
-    for name, ends in claim.parameters.items():
-        if name not in numbers:
-            return f"parameters.{printable(name)} is no number of the elite"
-        if text := _outside(f"parameters.{name}", ends, numbers[name]):
-            return text
-    if text := _outside("limit", claim.limits, robot.limit) or _another(claim.robot, robot.description, numbers):
+    if text := _outside("limit", claim.limits, robot.limit):
         return text
+    for numbers in _robots(claim, robot, elite):
+        for name, ends in claim.parameters.items():
+            if name not in numbers:
+                return f"parameters.{printable(name)} is no number of the elite"
+            if text := _outside(f"parameters.{name}", ends, numbers[name]):
+                return text
+        if text := _another(claim.robot, robot.description, numbers):
+            return text
     stored = claim_of(elite)
     largest = np.max(np.abs([float.fromhex(rate) for rate in np.ravel(stored["rates"])]))
     for key in _OF_THE_LOOP:
@@ -134,6 +140,18 @@ def difference(content: Mapping[str, Any], claim: Claim, elite: Elite) -> str:
 
 _OF_THE_LOOP = ("state_limits", "dt", "x", "u", "K", "x_goal", "K_goal", "rates")
 """The rates last: they follow from the others."""
+
+
+def _robots(claim: Claim, robot: ClaimedRobot, elite: Elite) -> Iterator[dict[str, float]]:
+    """The numbers of the elite's robot, then of random ones of the claim's box."""
+    yield {**elite.parameters, **robot.numbers}
+    box = {name: (float(low), float(high)) for name, (low, high) in claim.parameters.items() if low < high}
+    box = {name: ends for name, ends in box.items() if name in robot.numbers}
+    random = np.random.default_rng(0)
+    for _ in range(ROBOTS if box else 0):
+        numbers = {**elite.parameters, **robot.numbers}
+        numbers |= {name: float(random.uniform(*ends)) for name, ends in box.items()}
+        yield numbers | {name: polynomial.at(numbers) for name, polynomial in robot.derived.items()}
 
 
 def _outside(place: str, ends: tuple[Any, Any], value: float) -> str:

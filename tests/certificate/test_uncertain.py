@@ -264,6 +264,18 @@ def test_the_elite_is_one_of_its_robots(bearing, borne):
     assert "parameters.m in [0.58" in standing_of(file, Elite.of(arrays, heavy)).reason
 
 
+def test_a_box_of_robots_that_only_meet_at_the_elite_is_of_another(bearing, borne, tmp_path):
+    """Their inertia does not grow with the length as the elite's would."""
+    term = borne["claim"]["robot"]["mass"][0][0][0]
+    assert term["powers"] == {"l": 2, "m": 1}
+    term.update(powers={"m": 1}, cos=(0.4**2).hex())
+    file = tmp_path / "000.json"
+    file.write_text(json.dumps(resealed(borne)))
+    found = standing_of(file, Elite.read(bearing, "000"))
+    assert found.verdict == "of another elite"
+    assert "robot.mass: function 0 is another there" in found.reason
+
+
 def _at(content, *path):
     for key in path:
         content = content[key]

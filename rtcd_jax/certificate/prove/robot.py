@@ -96,13 +96,16 @@ class Polynomial:
     def __rpow__(self, base: Any) -> "Polynomial":
         raise NoPolynomial
 
+    def at(self, numbers: Mapping[str, float]) -> float:
+        return sum(c * math.prod(numbers[name] ** power for name, power in powers) for powers, c in self.terms.items())
+
 
 class ClaimedRobot(NamedTuple):
     """A robot as a claim says it.
 
     `numbers` are the values of those in `description`; `limit` is the motor's. `names` has every number that a
     configuration may call uncertain, with its name in a claim. `mixed` has those that are in arithmetic which is no
-    polynomial, with it.
+    polynomial, with it. `derived` has the stored parameters that follow from others.
     """
 
     description: check.Robot
@@ -110,6 +113,7 @@ class ClaimedRobot(NamedTuple):
     limit: float
     names: dict[str, str]
     mixed: dict[str, str]
+    derived: dict[str, Polynomial]
 
     def ranges(self, widths: Mapping[str, float]) -> dict[str, tuple[float, float]]:
         """Least and largest values of `numbers` by the relative half widths of names, rounded outward.
@@ -172,6 +176,7 @@ def claimed_robot(elite: Elite) -> ClaimedRobot:
         limit,
         {name: names[name] for name in uncertain},
         mixed,
+        {named.symbol: polynomials[named.name] for named, _ in robot.derived},
     )
 
 
