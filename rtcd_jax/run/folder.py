@@ -10,14 +10,13 @@ JAX are imported where states are kept.
 """
 
 import contextlib
-import dataclasses
 import fcntl
 import itertools
 import json
 import os
 import socket
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, Self, TypeVar, cast, final
@@ -361,71 +360,46 @@ def _load(checkpointer: Any, checkpoint: Any, state: State) -> State:
     import jax
     import jax.numpy as jnp
 
-    def load(state):
-        shapes = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=x.sharding), state)
+    def load(shapes: Any) -> Any:
+        shapes = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=everywhere), shapes)
         loaded = checkpointer.load(checkpoint.step, shapes)
         # A loaded array is bound to its devices; a fresh one moves to where the evaluations are.
         return jax.tree.map(lambda x: jnp.asarray(np.asarray(x.addressable_data(0))), loaded)
 
+    everywhere = jax.tree.leaves(state)[0].sharding
     kinds = (KeyError, ValueError, OSError, RecursionError)
     try:
         return load(state)
     except kinds as error:
-        for lacking in (LATER[1:], LATER):
-            with contextlib.suppress(*kinds):
-                return _completed(load(_former(state, lacking)), state)
+        with contextlib.suppress(*kinds):
+            return _of_an_older_version(load(checkpointer.metadata(checkpoint.step).metadata), state)
         raise UserError(
             f"{checkpoint.path} is no state of this search: it is damaged, or another version or precision wrote it; "
             "go on with what provenance.json names, or choose another folder"
         ) from error
 
 
-_STATUSES = 5
-"""How many there were before the last of `LATER`."""
+def _of_an_older_version(stored: Any, state: State) -> State:
+    """`state` with the arrays of the same names in `stored`.
 
-
-def _former(state: State, lacking: Sequence[str]) -> State:
-    """As states were before there were these volumes."""
-    from rtcd_jax.search.search import SearchState
-    from rtcd_jax.types import Volumes
-
-    def former(part: Any) -> Any:
-        if isinstance(part, SearchState):
-            return dataclasses.replace(part, elites=mapped(part.elites), counts=part.counts[:_STATUSES])
-        if isinstance(part, Volumes):
-            return Volumes(part.per_knot, {name: v for name, v in part.named.items() if name not in lacking})
-        return part
-
-    mapped = partial(_parts_mapped, former)
-    return mapped(state)
-
-
-def _completed(state: State, now: State) -> State:
-    """With all that `now` has: NaN for volumes, since the elites are evaluated again at a search's end."""
+    Older versions knew fewer volumes, which are NaN till the elites are evaluated again at a search's end, and fewer
+    statuses. Raises KeyError or ValueError for anything else that is lacking or of another shape or kind.
+    """
+    import jax
     import jax.numpy as jnp
 
-    from rtcd_jax.search.search import SearchState
-    from rtcd_jax.types import Volumes
+    name_of = partial(jax.tree_util.keystr, simple=True, separator=".")
+    by_name = {name_of(path): leaf for path, leaf in jax.tree_util.tree_leaves_with_path(stored)}
 
-    def completed(part: Any, now: Any) -> Any:
-        if isinstance(now, SearchState):
-            counts = jnp.pad(part.counts, (0, len(now.counts) - len(part.counts)))
-            return dataclasses.replace(part, elites=mapped(part.elites, now.elites), counts=counts)
-        if isinstance(now, Volumes):
-            return Volumes(
-                part.per_knot, {name: part.named.get(name, part.named["sum"] * np.nan) for name in now.named}
-            )
-        return part
+    def old(path: Any, leaf: Any) -> Any:
+        name = name_of(path)
+        if name not in by_name and name.rpartition(".")[2] in LATER:
+            return jnp.full_like(leaf, np.nan)
+        array = by_name[name]
+        if name == "counts":
+            array = jnp.pad(array, (0, len(leaf) - len(array)))
+        if (array.shape, array.dtype) != (leaf.shape, leaf.dtype):
+            raise ValueError(name)
+        return array
 
-    mapped = partial(_parts_mapped, completed)
-    return mapped(state, now)
-
-
-def _parts_mapped(change: Callable[..., Any], *states: Any) -> Any:
-    """`change` of a search's state, of the volumes in it, or of a leaf."""
-    import jax
-
-    from rtcd_jax.search.search import SearchState
-    from rtcd_jax.types import Volumes
-
-    return jax.tree.map(change, *states, is_leaf=lambda part: isinstance(part, SearchState | Volumes))
+    return jax.tree_util.tree_map_with_path(old, state)
