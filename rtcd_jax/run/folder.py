@@ -367,7 +367,7 @@ def _load(checkpointer: Any, checkpoint: Any, state: State) -> State:
         return jax.tree.map(lambda x: jnp.asarray(np.asarray(x.addressable_data(0))), loaded)
 
     everywhere = jax.tree.leaves(state)[0].sharding
-    kinds = (KeyError, ValueError, OSError, RecursionError)
+    kinds = (KeyError, ValueError, OSError, RecursionError, ExceptionGroup)  # Orbax loads in groups of tasks
     try:
         return load(state)
     except kinds as error:
