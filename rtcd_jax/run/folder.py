@@ -357,49 +357,38 @@ def _checkpoints(path: Path) -> Iterator[Any]:
 
 
 def _load(checkpointer: Any, checkpoint: Any, state: State) -> State:
-    import jax
-    import jax.numpy as jnp
-
-    def load(shapes: Any) -> Any:
-        shapes = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=everywhere), shapes)
-        loaded = checkpointer.load(checkpoint.step, shapes)
-        # A loaded array is bound to its devices; a fresh one moves to where the evaluations are.
-        return jax.tree.map(lambda x: jnp.asarray(np.asarray(x.addressable_data(0))), loaded)
-
-    everywhere = jax.tree.leaves(state)[0].sharding
-    kinds = (KeyError, ValueError, OSError, RecursionError, ExceptionGroup)  # Orbax loads in groups of tasks
-    try:
-        return load(state)
-    except kinds as error:
-        with contextlib.suppress(*kinds):
-            return _of_an_older_version(load(checkpointer.metadata(checkpoint.step).metadata), state)
-        raise UserError(
-            f"{checkpoint.path} is no state of this search: it is damaged, or another version or precision wrote it; "
-            "go on with what provenance.json names, or choose another folder"
-        ) from error
-
-
-def _of_an_older_version(stored: Any, state: State) -> State:
-    """`state` with the arrays of the same names in `stored`.
+    """`state` with the arrays of the same names in the checkpoint.
 
     Older versions knew fewer volumes, which are NaN till the elites are evaluated again at a search's end, and fewer
-    statuses. Raises KeyError or ValueError for anything else that is lacking or of another shape or kind.
+    statuses. Anything else that is lacking or of another shape or kind is refused.
     """
     import jax
     import jax.numpy as jnp
 
+    everywhere = jax.tree.leaves(state)[0].sharding
     name_of = partial(jax.tree_util.keystr, simple=True, separator=".")
-    by_name = {name_of(path): leaf for path, leaf in jax.tree_util.tree_leaves_with_path(stored)}
 
     def old(path: Any, leaf: Any) -> Any:
         name = name_of(path)
         if name not in by_name and name.rpartition(".")[2] in LATER:
             return jnp.full_like(leaf, np.nan)
-        array = by_name[name]
+        # A loaded array is bound to its devices; a fresh one moves to where the evaluations are.
+        array = np.asarray(by_name[name].addressable_data(0))
         if name == "counts":
-            array = jnp.pad(array, (0, len(leaf) - len(array)))
+            array = np.pad(array, (0, len(leaf) - len(array)))
         if (array.shape, array.dtype) != (leaf.shape, leaf.dtype):
             raise ValueError(name)
-        return array
+        return jnp.asarray(array)
 
-    return jax.tree_util.tree_map_with_path(old, state)
+    try:
+        # Asked for other shapes than the stored ones, Orbax begins to read, and leaves threads and coroutines behind.
+        stored = checkpointer.metadata(checkpoint.step).metadata
+        shapes = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=everywhere), stored)
+        loaded = jax.tree_util.tree_leaves_with_path(checkpointer.load(checkpoint.step, shapes))
+        by_name = {name_of(path): leaf for path, leaf in loaded}
+        return jax.tree_util.tree_map_with_path(old, state)
+    except (KeyError, ValueError, OSError, RecursionError) as error:
+        raise UserError(
+            f"{checkpoint.path} is no state of this search: it is damaged, or another version or precision wrote it; "
+            "go on with what provenance.json names, or choose another folder"
+        ) from error
