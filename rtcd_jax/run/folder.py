@@ -187,7 +187,7 @@ class RunFolder:
         latest = self._checkpointer.latest
         if latest is None or latest.step != generation:
             # tensorstore tells of a full disk by ValueError.
-            with writing(self._state_path, (OSError, ValueError)):
+            with writing(self._state_path, (OSError, ValueError)), self._cluster.linked():
                 self._checkpointer.save(generation, self._cluster.replicated(state), force=True)
         self._cluster.on_first(self.tell_time)
         self._saved = time.monotonic()

@@ -7,10 +7,12 @@ differ between two machines (a clock, a signal, the last bits of an eigenvector)
 import contextlib
 import os
 import signal
+import traceback
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor, wait
 from dataclasses import dataclass
 from functools import partial
+from pathlib import Path
 from typing import Any, TypeVar, final
 
 import jax
@@ -52,13 +54,10 @@ class Lost(Exception):
     """Another process of this run has ended, or the link to it has."""
 
 
-@contextlib.contextmanager
-def _linked() -> Iterator[None]:
-    """Around what needs the other processes."""
-    try:
-        yield
-    except (jax.errors.JaxRuntimeError, ValueError) as error:  # the latter where an array is fetched
-        raise Lost(f"lost another process of this run ({str(error).splitlines()[0]})") from error
+def _raised_by_jax(error: BaseException) -> bool:
+    """Where an array is fetched, a broken link is a ValueError, too."""
+    raised_in = Path(traceback.extract_tb(error.__traceback__)[-1].filename)
+    return isinstance(error, jax.errors.JaxRuntimeError) or Path(jax.__file__).parent in raised_in.parents
 
 
 @final
@@ -105,6 +104,20 @@ class Cluster:
         count = f"{len(self.devices)} {self.devices[0].device_kind} device{'s' if len(self.devices) > 1 else ''}"
         return f"{count} of {self.processes} processes" if self.processes > 1 else count
 
+    @contextlib.contextmanager
+    def linked(self) -> Iterator[None]:
+        """Around what needs the other processes.
+
+        Raises:
+            Lost: one of them has ended, or the link to it has. Other errors stay what they are.
+        """
+        try:
+            yield
+        except (jax.errors.JaxRuntimeError, ValueError) as error:
+            if self.processes == 1 or not _raised_by_jax(error):
+                raise
+            raise Lost(f"lost another process of this run ({str(error).splitlines()[0]})") from error
+
     def barrier(self) -> None:
         """Opens the links between the processes, while none has work yet: that waits for the others for seconds only,
         and later one may compile for minutes longer than another."""
@@ -115,7 +128,7 @@ class Cluster:
         """Process 0's numbers (a pytree of numpy's or Python's), on every process."""
         if self.processes == 1:
             return value
-        with _linked():
+        with self.linked():
             return multihost_utils.broadcast_one_to_all(value)
 
     def on_first(self, act: Callable[[], Value]) -> Value | None:
@@ -139,7 +152,7 @@ class Cluster:
         mine = np.frombuffer(mark.ljust(64).encode()[:64], np.uint8)
         if self.processes == 1:
             return
-        with _linked():
+        with self.linked():
             all_ = multihost_utils.process_allgather(mine)
         if not np.all(all_ == mine):
             raise UserError(f"the processes of this run were started with different values of: {what}")
@@ -148,7 +161,7 @@ class Cluster:
         """Arrays that are split over the mesh, whole and in numpy, on every process."""
         if self.processes == 1:
             return jax.device_get(tree)
-        with _linked():
+        with self.linked():
             return multihost_utils.process_allgather(tree, tiled=True)
 
     def replicated(self, tree: Any) -> Any:

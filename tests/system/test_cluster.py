@@ -20,15 +20,15 @@ SLOWLY = 0.5
 """Seconds of a generation: a signal to one process takes some time to reach all."""
 
 
-def start(path, seconds=0.0, devices=1, processes=2):
-    """The processes of one run, each with as many devices, talking over the loopback."""
+def start(path, seconds=0.0, devices=1, processes=2, last_saves=(0, 0)):
+    """The processes of one run, talking over the loopback; killable.py explains the words."""
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
     words = [str(word) for word in (path, "joint", seconds, devices, port, processes)]
     return [
         subprocess.Popen(
-            [sys.executable, "-m", "tests.run.killable", *words, str(index)],
+            [sys.executable, "-m", "tests.run.killable", *words, str(index), str(last_saves[index])],
             cwd=ROOT,
             stdout=subprocess.PIPE,
             stderr=subprocess.STDOUT,
@@ -92,6 +92,14 @@ def test_if_one_is_killed_the_other_ends_soon_and_the_run_goes_on_exactly(tmp_pa
     again = [end(process) for process in start(tmp_path / "run")]
     assert all(output.endswith("done\n") for output in again), again
     assert results(tmp_path / "run") == whole
+
+
+def test_if_one_ends_while_a_state_is_saved_it_is_a_lost_process_and_no_damaged_disk(tmp_path):
+    processes = start(tmp_path / "run", SLOWLY, last_saves=(0, 3))
+    output = end(processes[0])
+    end(processes[1])
+    assert processes[0].returncode == Exit.LOST_PROCESS, output
+    assert "lost another process of this run" in output
 
 
 @pytest.mark.parametrize("devices", [pytest.param(1, marks=pytest.mark.slow), 4])
