@@ -102,14 +102,18 @@ def own_elite(xml, parameters, limit, **section):
     return standing_elite(config, parameters | {"motor_limit": limit}, limit, len(config.states))
 
 
-def test_an_own_robot_in_space_with_a_spring_on_a_slide_is_c_mujoco_s():
-    elite = own_elite(
+def sprung_elite():
+    return own_elite(
         SPRUNG,
         {"heavy": 0.7, "long": 0.4, "ratio": 1.7},
         2.0,
         constants={"ratio": 1.7},
         set={"body.pole": {"mass": "heavy"}, "body.tip": {"pos": ["long/ratio", 0.1, "long**2"]}},
     )
+
+
+def test_an_own_robot_in_space_with_a_spring_on_a_slide_is_c_mujoco_s():
+    elite = sprung_elite()
     assert_field_is_mujoco_s(elite)
     names = claimed_robot(elite).numbers
     assert names == {"heavy": 0.7, "long": 0.4, "long/ratio": 0.4 / 1.7}, "a quotient is a number of its own"
@@ -125,13 +129,7 @@ def test_an_own_robot_in_space_with_a_spring_on_a_slide_is_c_mujoco_s():
     ],
 )
 def test_what_no_proof_bears_is_refused(uncertainty, reason):
-    elite = own_elite(
-        SPRUNG,
-        {"heavy": 0.7, "long": 0.4, "ratio": 1.7},
-        2.0,
-        constants={"ratio": 1.7},
-        set={"body.pole": {"mass": "heavy"}, "body.tip": {"pos": ["long/ratio", 0.1, "long**2"]}},
-    )
+    elite = sprung_elite()
     with pytest.raises(UserError, match=reason):
         claimed(elite, **uncertainty)
 

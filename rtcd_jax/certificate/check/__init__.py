@@ -70,6 +70,7 @@ from rtcd_jax.certificate.check.exact import (
     Refused,
     Undecided,
     alternating,
+    exact,
     near,
     printable,
     require,

@@ -47,6 +47,11 @@ def printable(text: object, longest: int = 400) -> str:
     return shown if len(shown) <= longest and len(str(text)) <= longest else f"{shown[: longest - 3]}..."
 
 
+def exact(double: float):
+    """The number that a double is; OverflowError where it is none."""
+    return Q(*double.as_integer_ratio())
+
+
 def rounded(q) -> float:
     """The double of a number, infinite where it is larger than all doubles."""
     try:

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple, cast, final
 import numpy as np
 
 from rtcd_jax.certificate import check
-from rtcd_jax.certificate.check import Claim, GramCertificate, Interval, Obligation, Q, Refused
+from rtcd_jax.certificate.check import Claim, GramCertificate, Interval, Obligation, Refused
 from rtcd_jax.certificate.prove import sdp as program
 from rtcd_jax.certificate.prove.closed_loop import Loop, on_grid
 from rtcd_jax.certificate.prove.levels import carried_back, unit_directions
@@ -126,7 +126,7 @@ class BackwardProof:
         chord = (b - a) / 2
         at_start, at_end = (a_rate * half - chord) / 2, (chord - b_rate * half) / 2
         bend = [on_grid((at_end + at_start) / 2), on_grid((at_end - at_start) / 2)]
-        fractions = Q(*start.as_integer_ratio()), Q(*end.as_integer_ratio())
+        fractions = check.exact(start), check.exact(end)
         order = TIERS[self.claim.n][0][0]
         late = loop.late_rows(k, start, end) if self.claim.first_order else []
         return Interval(k, *fractions, on_grid(a), state.axes, bend, (TIME_ORDER, order), {}, late), rho

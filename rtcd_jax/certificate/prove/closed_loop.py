@@ -215,19 +215,15 @@ class Loop:
         self.parameters = {name: float(low + high) / 2 for name, (low, high) in claim.parameters.items()}
         self.limits, self.disturbance = floats(claim.limits), float(claim.disturbance)
         self.limit, self.dt = float(self.limits.mean()), float(claim.dt)
-        self.late = [float(check.input_error(claim, k)) for k in range(len(claim.u))]
-        self.late_at_goal = float(check.error_under(claim, [claim.K_goal]))
+        late = [check.input_error(claim, k) for k in range(len(claim.u))]
+        late_at_goal = check.error_under(claim, [claim.K_goal])
         if claim.first_order:
-            self.late = [
-                float(
-                    check.lateness(
-                        claim, check.input_error(claim, k), _exact(misfit), check.jumps_within_reach(claim, k, 0)
-                    )
-                )
-                for k, misfit in enumerate(misfits)
+            late = [
+                check.lateness(claim, error, check.exact(misfit), check.jumps_within_reach(claim, k, 0))
+                for k, (error, misfit) in enumerate(zip(late, misfits, strict=True))
             ]
-            at_goal = check.error_under(claim, [claim.K_goal])
-            self.late_at_goal = float(check.lateness(claim, at_goal, _exact(misfit_at_goal), check.Q(0)))
+            late_at_goal = check.lateness(claim, late_at_goal, check.exact(misfit_at_goal), check.Q(0))
+        self.late, self.late_at_goal = [float(each) for each in late], float(late_at_goal)
         self._points = ControlPoints.of(claim)
         self.x, self.rates, self.u = floats(claim.x), floats(claim.rates), floats(claim.u)
         self.gains, self.goal, self.goal_gain = floats(claim.K), floats(claim.x_goal), floats(claim.K_goal)
@@ -364,10 +360,6 @@ class Loop:
 def on_grid(matrix: np.ndarray) -> list[list]:
     """The exact matrix nearest to `matrix` on the grid."""
     return [[check.Q(int(c), 1 << GRID) for c in row] for row in np.rint(matrix * 2.0**GRID)]
-
-
-def _exact(value: float) -> Any:
-    return check.Q(*float(value).as_integer_ratio())
 
 
 def _touching(clearance: np.ndarray, s: np.ndarray) -> float:

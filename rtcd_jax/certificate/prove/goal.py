@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 
 from rtcd_jax.certificate import check
-from rtcd_jax.certificate.check import Claim, Q, Refused, Shell
+from rtcd_jax.certificate.check import Claim, Refused, Shell
 from rtcd_jax.certificate.prove.backward import prove
 from rtcd_jax.certificate.prove.closed_loop import Loop, on_grid
 from rtcd_jax.certificate.prove.levels import goal_level, unit_directions
@@ -62,7 +62,7 @@ def _at_level(
         field = check.goal_field(claim, axes, order, "goal", late)
         while waiting:  # from the outside in
             start, end = waiting.pop()
-            ends = Q(*start.as_integer_ratio()), Q(*end.as_integer_ratio())
+            ends = check.exact(start), check.exact(end)
             proof = None
             if start or not claim.moves_the_goal:
                 todo = check.goal_obligations(claim, field, *ends)

@@ -24,7 +24,7 @@ def push_margin(claim: Claim, intervals: Sequence[Interval]) -> float:
     box = check.cube(claim)
 
     def holds(push: float) -> bool:
-        return all(check.is_positive(clearance(Q(*push.as_integer_ratio())), box) for clearance in clearances)
+        return all(check.is_positive(clearance(check.exact(push)), box) for clearance in clearances)
 
     low, high = 0.0, 1.0
     while holds(high):
@@ -66,18 +66,14 @@ def feedback_delay(claim: Claim, elite: Elite) -> Delay:
     for k in range(len(claim.u)):
         first, last = (on_grid(loop.axes(k, end, 1.0, 0.0)[0]) for end in (0.0, 1.0))
         intervals.append(Interval(k, Q(0), Q(1), first, last, bend, orders, {}, loop.late_rows(k, 0.0, 1.0)))
-    axes, order, row = (
-        on_grid(loop.axes(len(claim.u) - 1, 1.0, 1.0, 0.0)[0]),
-        TIERS[claim.n][0][0],
-        loop.goal_late_row(),
-    )
+    axes, order = on_grid(loop.axes(len(claim.u) - 1, 1.0, 1.0, 0.0)[0]), TIERS[claim.n][0][0]
     speeds = [check.funnel_speed(claim, interval, "speed") for interval in intervals]
     speed = SPEED_CLEARANCE * float(max(*speeds, check.goal_speed(claim, axes, order, "speed")))
-    claim = claim._replace(speed=Q(*speed.as_integer_ratio()))
+    claim = claim._replace(speed=check.exact(speed))
     bounds = [check.funnel_delay(claim, interval, "delay") for interval in intervals]
-    bounds.append(check.goal_delay(claim, axes, order, "delay", row))
+    bounds.append(check.goal_delay(claim, axes, order, "delay", loop.goal_late_row()))
     jerk, reaction = (SPEED_CLEARANCE * float(max(each)) for each in list(zip(*bounds, strict=True))[:2])
-    claim = claim._replace(reaction=Q(*reaction.as_integer_ratio()))
+    claim = claim._replace(reaction=check.exact(reaction))
     jumps = [0.0] + [SPEED_CLEARANCE * float(check.funnel_jump(claim, each, "jump")) for each in intervals[1:]]
     *misfits, at_goal = (float(each.misfit) for each in bounds)
     return Delay(speed, jerk, reaction, jumps, misfits, at_goal)
