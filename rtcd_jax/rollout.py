@@ -62,13 +62,9 @@ def mjx_rate(
         return MjxStepper(robot[0]).dynamics(robot[1], x, u)
 
     robot, axes = (plant, design), jax.tree.map(lambda leaf: -1 if jnp.ndim(leaf) else None, (plant, design))
-    flat = jax.tree.map(lambda leaf: _flattened(leaf, x.shape[1:]) if jnp.ndim(leaf) else leaf, robot)
+    flat = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, x.shape[1:]).reshape(-1) if jnp.ndim(leaf) else leaf, robot)
     over_states = jax.vmap(one, in_axes=(axes, -1, -1), out_axes=-1)
     return over_states(flat, x.reshape(plant.n, -1), u.reshape(plant.m, -1)).reshape(x.shape)
-
-
-def _flattened(leaf, shape: tuple[int, ...]):
-    return jnp.broadcast_to(leaf, shape).reshape(-1)
 
 
 class TrackingData(NamedTuple):

@@ -48,10 +48,10 @@ def arrays_of(problem: Problem, evaluation: Evaluation) -> dict[str, np.ndarray]
 
 def policy_of(arrays: Mapping[str, Any], record: Mapping[str, Any]) -> Policy:
     """The policy that `arrays_of` and `record_of` stored, of a candidate that has a funnel."""
-    ok, told = jnp.int32(Status.OK), record.get("trajectory", {})
+    ok, stored = jnp.int32(Status.OK), record.get("trajectory", {})
     us, xs, time, gains, values = (jnp.asarray(arrays[name]) for name in ("u", "x", "time", "K", "S"))
-    cost, defect = (jnp.asarray(told.get(name, 0.0)) for name in ("cost", "defect"))
-    rates, iterations = arrays.get("S_rates"), jnp.asarray(told.get("iterations", 0))
+    cost, defect = (jnp.asarray(stored.get(name, 0.0)) for name in ("cost", "defect"))
+    rates, iterations = arrays.get("S_rates"), jnp.asarray(stored.get("iterations", 0))
     motion = Trajectory(us, xs, time[1] - time[0], cost, defect, iterations, ok)
     return Policy(motion, gains, values, ok, None if rates is None else jnp.asarray(rates))
 

@@ -181,6 +181,6 @@ def require_delay(claim: Claim, bounds: Bounds, place: str) -> None:
     """The bounds are those of the claim, and small enough for the theorem."""
     unit = claim.robot.input_unit
     for name, value, claimed in (("jerk", bounds.jerk, claim.jerk), ("reaction", bounds.reaction, claim.reaction)):
-        told = f"the feedback's {name} may be {rounded(value):.6g} {unit}, more than claim.{name}"
-        require(value <= claimed, place, told)
+        reason = f"the feedback's {name} may be {rounded(value):.6g} {unit}, more than claim.{name}"
+        require(value <= claimed, place, reason)
     require(claim.age * claim.reaction <= 1, place, "the age times claim.reaction must be at most 1")

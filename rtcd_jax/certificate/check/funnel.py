@@ -220,8 +220,8 @@ def require_jump(claim: Claim, interval: Interval, place: str) -> None:
         return
     found, claimed = funnel_jump(claim, interval, place), claim.jumps[interval.knot]
     unit = claim.robot.input_unit
-    told = f"the feedback's rate may jump by {rounded(found):.6g} {unit}/s, by more than claim.jumps[{interval.knot}]"
-    require(found <= claimed, place, told)
+    reason = f"the feedback's rate may jump by {rounded(found):.6g} {unit}/s, by more than claim.jumps[{interval.knot}]"
+    require(found <= claimed, place, reason)
 
 
 def funnel_jump(claim: Claim, interval: Interval, place: str) -> Any:
@@ -243,8 +243,8 @@ def speed_of(claim: Claim, field: Field, gain: list[Taylor], rate: list[Taylor],
 
 
 def require_speed(claim: Claim, fastest: Any, place: str) -> None:
-    told = f"the feedback may change by {rounded(fastest):.6g} {claim.robot.input_unit}/s, by more than claim.speed"
-    require(fastest <= claim.speed, place, told)
+    reason = f"the feedback may change by {rounded(fastest):.6g} {claim.robot.input_unit}/s, by more than claim.speed"
+    require(fastest <= claim.speed, place, reason)
 
 
 def require_bounds(claim: Claim, data: Motion, place: str) -> None:

@@ -47,7 +47,7 @@ class Outcome(NamedTuple):
     """
 
     elite: str
-    rung: str
+    guarantee: str
     start: float
     intervals: int
     seconds: float
@@ -64,7 +64,7 @@ class Outcome(NamedTuple):
 def certify_elite(
     run: Path,
     name: str,
-    rung: str,
+    guarantee: str,
     on_step: Callable[[Step], None],
     optimize_value: bool = False,
     uncertainty: Path | None = None,
@@ -88,10 +88,10 @@ def certify_elite(
         loop_record |= delay.record()
         misfits = delay.misfits, delay.misfit_at_goal
     claim = _read(loop_record, elite)
-    loop, exact = Loop(claim, elite, *misfits), rung == "proved"
+    loop, exact = Loop(claim, elite, *misfits), guarantee == "proved"
     journal = Journal(
         folder / f".{name}.partial.jsonl",
-        {"claim": check.digest(loop_record), "rung": rung, "optimize_value": optimize_value, "solver": solver},
+        {"claim": check.digest(loop_record), "rung": guarantee, "optimize_value": optimize_value, "solver": solver},
     )
     if optimize_value:
         loop = _shaped(loop, journal)
@@ -125,16 +125,18 @@ def certify_elite(
         "claim": with_digests({**loop_record, "start": start, "push": double(push)}),
         "funnel": intervals,
         "goal": goal,
-        "notes": {"elite": name, "rung at writing": rung, "solver": solver},
+        "notes": {"elite": name, "rung at writing": guarantee, "solver": solver},
     }
-    outcome = _finish(folder / f"{name}.json", with_digests(content), elite, rung, seconds, journal)
+    outcome = _finish(folder / f"{name}.json", with_digests(content), elite, guarantee, seconds, journal)
     return outcome._replace(beside=elite.guarantee)
 
 
-def _finish(path: Path, content: dict[str, Any], elite: Elite, rung: str, seconds: float, journal: Journal) -> Outcome:
+def _finish(
+    path: Path, content: dict[str, Any], elite: Elite, guarantee: str, seconds: float, journal: Journal
+) -> Outcome:
     """Writes the certificate; one that says *proved* after the checker has accepted the whole file."""
     file = (json.dumps(content, separators=(",", ":")) + "\n").encode()
-    if rung == "proved":
+    if guarantee == "proved":
         digest = hashlib.sha256(file).hexdigest()
         remember(digest, accepted(check.check(check.parse(file)), digest))
     replace(path, file)
@@ -151,7 +153,7 @@ def _finish(path: Path, content: dict[str, Any], elite: Elite, rung: str, second
         "integral": float(np.trapezoid(per_knot, dx=step)),
         "goal": float(per_knot[-1]),
     }
-    return Outcome(path.stem, rung, start * step, len(intervals), seconds, sampled, volumes)
+    return Outcome(path.stem, guarantee, start * step, len(intervals), seconds, sampled, volumes)
 
 
 def _read(loop_record: Mapping[str, Any], elite: Elite) -> Claim:

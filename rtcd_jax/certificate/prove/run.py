@@ -31,7 +31,7 @@ RANKED = 3
 def certify_run(
     folder: Path,
     elites: int,
-    rung: str,
+    guarantee: str,
     workers: int,
     console: Console,
     optimize_value: bool = False,
@@ -60,7 +60,7 @@ def certify_run(
     former = read_json(summary, "remove it, or make it again") if summary.is_file() else {}
     outcomes: dict[str, Outcome | None] = {}
     clock, reached = Clock(), dict.fromkeys(names, 0.0)
-    for event in _events(folder, names, workers, (rung, optimize_value, uncertainty, solver)):
+    for event in _events(folder, names, workers, (guarantee, optimize_value, uncertainty, solver)):
         if isinstance(event, Step):
             reached[event.elite] = 1 - event.knot / event.knots
             done = sum(reached.values())
@@ -74,10 +74,12 @@ def certify_run(
     replace_json(summary, former | {name: _summary(outcomes[name]) for name in names})
     finished = [outcome for name in names if (outcome := outcomes[name]) is not None]
     beside = "/".join(dict.fromkeys(outcome.beside for outcome in finished)) or "sampled"
-    console.message(_table(finished, f"volumes: {beside} / {rung}"))
+    console.message(_table(finished, f"volumes: {beside} / {guarantee}"))
     if len(finished) >= RANKED:
         correlation = rank_correlation(finished)
-        console.message(f"rank correlation of sampled and {rung} sums over {len(finished)} elites: {correlation:.3f}")
+        console.message(
+            f"rank correlation of sampled and {guarantee} sums over {len(finished)} elites: {correlation:.3f}"
+        )
     for name in names:
         if outcomes[name] is None:
             console.message(f"{name}: no goal region can be shown at any level that was tried")
@@ -113,8 +115,8 @@ def _remember(steps: Any) -> None:
     _steps = steps
 
 
-def _work(folder: Path, name: str, rung: str, *how: Any) -> Outcome | None:
-    return certify_elite(folder, name, rung, _steps.put, *how)
+def _work(folder: Path, name: str, guarantee: str, *how: Any) -> Outcome | None:
+    return certify_elite(folder, name, guarantee, _steps.put, *how)
 
 
 def rank_correlation(outcomes: Sequence[Outcome]) -> float:
