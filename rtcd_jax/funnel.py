@@ -64,7 +64,7 @@ def estimate_funnel(
     rollouts = Rollouts.of(problem, candidate, policy, budget.funnel)
     sets = rollouts.sets
     boxes = sets.radii_inside(jnp.asarray(problem.state_limits, sets.centers.dtype))
-    saturated = saturating_radius(problem, policy, sets.part(slice(-1, None)))
+    saturated = saturating_radius(problem.input_limits(candidate.design), policy, sets.part(slice(-1, None)))
     boxes = jnp.minimum(boxes, REACH * saturated)
     last = goal_level(rollouts, boxes[-1], saturated, keys[0], budget)
 
@@ -162,11 +162,13 @@ class _Step(NamedTuple):
         return self.ends(radii, y, rollout.closed_form(self.rollouts.problem.plant, opponent))[0]
 
 
-def saturating_radius(problem: Problem, policy: Policy, goal_set: Ellipsoids) -> Float[Array, ""]:
-    """The radius of the goal's set at which an input of the goal's LQR reaches its limit."""
+def saturating_radius(
+    limits: Float[Array | np.ndarray, " m"], policy: Policy, goal_set: Ellipsoids
+) -> Float[Array, ""]:
+    """The radius of the goal's set at which an input of the goal's LQR reaches one of the `limits`."""
     rows = solve_lower(goal_set.factors, policy.gains[-1].T[..., None])  # u = -K L'^-1 y
     largest = jnp.sqrt(jnp.sum(rows**2, 0))[:, 0]
-    return jnp.min(jnp.asarray(problem.input_limits, largest.dtype) / largest)
+    return jnp.min(jnp.asarray(limits, largest.dtype) / largest)
 
 
 def goal_level(

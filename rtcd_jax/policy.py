@@ -135,7 +135,7 @@ def options(problem: Problem, candidate: Candidate) -> dict[str, Any]:
 def input_weights(problem: Problem, candidate: Candidate, us: Float[Array, "m *batch"]) -> Float[Array, "m *batch"]:
     """The diagonal of the controller's R where the feed-forward is `us`."""
     policy, behind = options(problem, candidate), (1,) * (us.ndim - 1)
-    limits = jnp.asarray(problem.input_limits, us.dtype).reshape(-1, *behind)
+    limits = jnp.asarray(problem.input_limits(candidate.design), us.dtype).reshape(-1, *behind)
     left = jnp.maximum(1 - jnp.abs(us) / limits, policy["authority"])
     return policy["input_weight"] * candidate.r.reshape(-1, *behind) / left**2
 

@@ -6,7 +6,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Array, Float
 
 from rtcd_jax.config.load import Config
 from rtcd_jax.plants import make_plant
@@ -55,7 +55,6 @@ class Problem:
     start: Float[np.ndarray, " n"]
     goal: Float[np.ndarray, " n"]
     state_limits: Float[np.ndarray, " n"]
-    input_limits: Float[np.ndarray, " m"]
     variables: tuple[Variable, ...]
     uncertainty: Uncertainty | None = None
     """What the funnels must bear; None for one exact model."""
@@ -63,6 +62,18 @@ class Problem:
     @property
     def intervals(self) -> int:
         return self.config.trajectory.knots - 1
+
+    @property
+    def designs_motors(self) -> bool:
+        """Whether a motor's limit depends on the design."""
+        return isinstance(self.input_limits(initial_design(self)), jax.Array)
+
+    def input_limits(self, design: eqx.Module) -> Float[Array | np.ndarray, "m *batch"]:
+        """Largest |u_i| of every input; a constant of the program if it does not depend on the design."""
+        limits = self.plant.input_limits(design)
+        if all(isinstance(limit, int | float) for limit in limits):
+            return np.array(limits, float)
+        return jnp.stack(jnp.broadcast_arrays(*map(jnp.asarray, limits)))
 
     @property
     def free(self) -> tuple[Variable, ...]:
@@ -90,7 +101,6 @@ def make_problem(config: Config) -> Problem:
         start=np.array(config.start, float),
         goal=np.array(config.task.goal, float),
         state_limits=np.array(config.task.state_limits, float),
-        input_limits=np.array(plant.input_limit, float),
         variables=tuple(_variables(config)),
         uncertainty=_uncertainty(config),
     )
@@ -211,7 +221,8 @@ def _require_agreement(problem: Problem) -> None:
     designs = [_design(problem, share) for share in (0.0, *rng.random(DESIGNS))]
     largest = np.minimum(problem.state_limits, LARGEST_STATE)
     x = rng.uniform(-largest, largest, (STATES, problem.plant.n))
-    u = rng.uniform(-problem.input_limits, problem.input_limits, (STATES, problem.plant.m))
+    limits = np.asarray(problem.input_limits(designs[0]))
+    u = rng.uniform(-limits, limits, (STATES, problem.plant.m))
     require_agreement(problem.plant, designs, x, u)
 
 

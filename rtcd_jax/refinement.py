@@ -403,7 +403,7 @@ class Refinement:
         error = jnp.sqrt(rho) * solve_lower_transposed(factors, y[:, None])[:, 0]
         x, slope = at.centers[..., None] + error, mv(values, error)
         asked = at.inputs[..., None] - mv(gains, error)
-        bounds = jnp.asarray(self.problem.input_limits, rho.dtype)[:, None, None]
+        bounds = jnp.asarray(self.problem.input_limits(start.design), rho.dtype)[:, None, None]
         center_rates = at.center_rates[..., None]
         drift = jnp.sum(error * mv(rates, error), 0)
 

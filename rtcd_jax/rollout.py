@@ -122,7 +122,7 @@ def roll_intervals(
 
     `x` are states at the intervals' starts.
     """
-    limits, bounds = problem.state_limits, _column(problem.input_limits, x)
+    limits, bounds = problem.state_limits, _column(problem.input_limits(candidate.design), x)
     align = partial(_align, behind=x.ndim - 2)
     feedforward = align(tracking.inputs)
 
@@ -160,7 +160,7 @@ def roll_at_goal(
 
     `goal_lqr` are its gain and its value matrix. Each `step` [s] is taken in equal `parts`.
     """
-    limits, bounds = problem.state_limits, _column(problem.input_limits, x)
+    limits, bounds = problem.state_limits, _column(problem.input_limits(candidate.design), x)
     gain, cost = (_align(part, x.ndim - 1) for part in goal_lqr)
     rest = jnp.zeros((x.shape[0], *(1,) * (x.ndim - 1)), x.dtype)
 

@@ -9,6 +9,7 @@ solver refills its lanes as candidates finish, so that slow ones do not hold up 
 """
 
 from functools import partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -20,7 +21,8 @@ from rtcd_jax.numerics import interior_point
 from rtcd_jax.numerics.derivatives import jacobian
 from rtcd_jax.numerics.integrate import componentwise, join, rk4, split
 from rtcd_jax.numerics.loops import packed_scan
-from rtcd_jax.problem import Problem
+from rtcd_jax.plants.base import Components
+from rtcd_jax.problem import Problem, initial_design
 from rtcd_jax.types import Candidate, Status, Trajectory
 
 SWING = 0.4
@@ -51,13 +53,15 @@ def plan(problem: Problem, candidates: Candidate) -> Trajectory:
         return _rest(problem, candidates.q)
     parameters = jax.tree.map(lambda leaf: jnp.moveaxis(leaf, 0, -1), candidates)
     control = interior_point.ControlProblem(
-        interval=lambda x, u, h, candidate: interval_map(problem, candidate, x, u, h, settings.substeps),
-        rate=lambda x, u, candidate: problem.plant.dynamics(candidate.design, x, u),
-        running=partial(_running, problem),
+        interval=lambda x, u, h, candidate: interval_map(
+            problem, candidate, x, _inputs(problem, candidate, u), h, settings.substeps
+        ),
+        rate=lambda x, u, candidate: problem.plant.dynamics(candidate.design, x, _inputs(problem, candidate, u)),
+        running=lambda x, u, candidate: _running(problem, x, _inputs(problem, candidate, u), candidate),
         start=problem.start,
         goal=problem.goal,
         state_limits=settings.limit_share * problem.state_limits,
-        input_limits=settings.input_share * problem.input_limits,
+        input_limits=settings.input_share * np.asarray(problem.input_limits(initial_design(problem))),
         step_limits=(settings.step.min, settings.step.max),
     )
     most = settings.max_iterations
@@ -73,7 +77,8 @@ def plan(problem: Problem, candidates: Candidate) -> Trajectory:
     family = starts(problem, parameters.q.dtype)
     none = _nothing(family, candidates.q.shape[0])
     best, _ = packed_scan(attempt, none, (np.arange(len(SHARES)), family), carry=False)
-    us, xs, h = (jnp.moveaxis(leaf, -1, 0) for leaf in (best.us, best.xs, best.h))
+    us = _inputs(problem, parameters, jnp.moveaxis(best.us, 1, 0)).T
+    xs, h = (jnp.moveaxis(leaf, -1, 0) for leaf in (best.xs, best.h))
     status = jnp.where(best.solved, Status.OK, Status.TRAJECTORY_NOT_SOLVED).astype(jnp.int32)
     return Trajectory(us, xs, h, best.cost, best.defect, best.iterations, status)
 
@@ -92,6 +97,19 @@ def _rest(problem: Problem, like: Float[Array, "P n"]) -> Trajectory:
         iterations=none,
         status=none,
     )
+
+
+def _inputs(problem: Problem, candidate: Candidate, us: Array | Components) -> Any:
+    """The inputs' components that the optimizer's `us` stand for.
+
+    Its box is one for all candidates: where a motor's limit is a design, its inputs are those of the initial design's
+    motor, of which the candidate's gives the same share.
+    """
+    if not problem.designs_motors:
+        return us
+    limits, known = problem.input_limits(candidate.design), problem.input_limits(initial_design(problem))
+    given = tuple(limit / first * u for limit, first, u in zip(limits, known, us, strict=True))
+    return given if isinstance(us, tuple) else jnp.stack(given)
 
 
 def interval_map(

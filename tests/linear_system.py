@@ -43,8 +43,7 @@ class Equations(Plant):
     Design: ClassVar = Nothing
     xml: ClassVar = ""
 
-    @property
-    def input_limit(self):
+    def input_limits(self, design):
         return (self.limit,)
 
     def motor_speeds(self, design, x):

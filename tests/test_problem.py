@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from rtcd_jax.config.load import EXAMPLE, parse_yaml
-from rtcd_jax.problem import make_problem
+from rtcd_jax.problem import initial_design, make_problem
 from rtcd_jax.system.errors import ConfigError
 from tests.plants.robots import packaged
 
@@ -17,7 +17,7 @@ def test_the_plant_has_the_constants_of_the_configuration():
     text = EXAMPLE.replace("{name: pendulum}", "{name: pendulum, damping: 0.2, gravity: 3.7, torque_limit: 1.5}")
     problem = problem_of(text)
     assert problem.plant == packaged("pendulum", damping=0.2, gravity=3.7, torque_limit=1.5)
-    np.testing.assert_array_equal(problem.input_limits, [1.5])
+    np.testing.assert_array_equal(problem.input_limits(initial_design(problem)), [1.5])
 
 
 def test_task_and_grid_are_those_of_the_configuration():

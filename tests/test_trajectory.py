@@ -10,10 +10,12 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from rtcd_jax import trajectory
-from rtcd_jax.config.load import load
-from rtcd_jax.genome import decode
+from rtcd_jax.config import yaml12
+from rtcd_jax.config.load import EXAMPLE, load, parse
+from rtcd_jax.config.plants import PLANTS
+from rtcd_jax.genome import decode, initial_genome
 from rtcd_jax.numerics.integrate import rk4
-from rtcd_jax.problem import make_problem
+from rtcd_jax.problem import initial_design, make_problem
 from rtcd_jax.trajectory import plan
 from rtcd_jax.types import Status
 from tests.paths import CONFIGS
@@ -121,7 +123,7 @@ def test_ends_are_pinned_exactly(problem, planned):
 def test_boxes_hold_at_every_knot(problem, planned):
     limits, step = problem.state_limits, problem.config.trajectory.step
     assert np.all(np.abs(planned.xs) <= limits)
-    assert np.all(np.abs(planned.us) <= problem.input_limits)
+    assert np.all(np.abs(planned.us) <= problem.input_limits(initial_design(problem)))
     assert np.all((planned.dt >= step.min) & (planned.dt <= step.max))
 
 
@@ -215,6 +217,25 @@ def test_shapes_are_those_of_the_nouns(planned, problem):
 
 
 @pytest.mark.slow
+def test_a_motor_whose_limit_is_a_design_moves_as_one_of_that_limit():
+    def planned(limit, **design):
+        data = yaml12.read(EXAMPLE)
+        arms = {"body.bob": {"ipos": [0, 0, "-length"], "mass": "mass", "inertia": [0, 0, 0]}}
+        data["plant"] = {"mjcf": "own.xml", "xml": PLANTS["pendulum"].xml, "inputs": {"torque": limit}, "set": arms}
+        data["design"] = {name: {**each, "unit": "-"} for name, each in (data["design"] | design).items()}
+        problem = make_problem(parse(data))
+        candidate = decode(problem, initial_genome(problem))
+        if design:
+            candidate = eqx.tree_at(lambda each: each.design.motor, candidate, jnp.asarray(2.0))
+        return jax.jit(partial(plan, problem))(jax.tree.map(lambda leaf: leaf[None], candidate))
+
+    designed = planned({"limit": "motor"}, motor={"initial": 2.5, "min": 1.0, "max": 3.0})
+    given = planned({"limit": 2.0})
+    assert designed.status == given.status == Status.OK
+    assert 0.99 * 2.0 < np.max(np.abs(designed.us)) <= 2.0
+    np.testing.assert_allclose(designed.cost, given.cost, rtol=1e-4)
+
+
 def test_a_share_of_the_motor_is_left_to_the_controller(problem, draw):
     """The motion needs no more than its share, which costs; the controller's limit is the motor's."""
     candidates = draw(8)
@@ -222,7 +243,7 @@ def test_a_share_of_the_motor_is_left_to_the_controller(problem, draw):
     spared = jax.jit(partial(plan, with_trajectory(problem, input_share=0.8)))(candidates)
     both = np.asarray((whole.status == Status.OK) & (spared.status == Status.OK))
     assert np.sum(both) >= 6
-    limit = float(problem.input_limits[0])
+    limit = float(problem.input_limits(initial_design(problem))[0])
     assert np.max(np.abs(whole.us[both])) > 0.99 * limit
     assert np.max(np.abs(spared.us[both])) <= 0.8 * limit * (1 + 1e-9)
     assert np.all(spared.cost[both] >= whole.cost[both] * (1 - 1e-3))

@@ -14,7 +14,7 @@ import casadi as ca
 import numpy as np
 from swing_up import Motion, Solved, interval
 
-from rtcd_jax.problem import Problem
+from rtcd_jax.problem import Problem, initial_design
 
 FLAGS = ("-O2", "-march=native")
 SETTINGS = {
@@ -102,7 +102,8 @@ def _free_step(problem: Problem) -> _Layout:
 
     step = problem.config.trajectory.step
     limits = problem.config.trajectory.limit_share * problem.state_limits
-    upper = np.concatenate([np.tile(limits, count + 1), np.tile(problem.input_limits, count), [step.max]])
+    inputs = problem.input_limits(initial_design(problem))
+    upper = np.concatenate([np.tile(limits, count + 1), np.tile(inputs, count), [step.max]])
     lower = np.concatenate([-upper[:-1], [step.min]])
     for end, state in ((slice(0, n), problem.start), (slice(count * n, (count + 1) * n), problem.goal)):
         lower[end] = upper[end] = state
@@ -130,7 +131,7 @@ def _stages(problem: Problem) -> _Layout:
     step, intervals = problem.config.trajectory.step, np.ones((count, 1))
     limits = problem.config.trajectory.limit_share * problem.state_limits
     states = np.tile(limits, (count + 1, 1))
-    inputs = problem.input_limits * intervals
+    inputs = problem.input_limits(initial_design(problem)) * intervals
     lower, upper = point(Motion(-states, -inputs, step.min)), point(Motion(states, inputs, step.max))
     size = g.size1()
     mine = np.concatenate([np.arange(rows), np.arange(rows + n, size - n)])

@@ -189,7 +189,7 @@ def _positive_weights(weights: WeightsConfig) -> Iterator[Problem]:
 
 
 def _uncertain(plant: PlantConfig, uncertainty: UncertaintyConfig, funnel: FunnelConfig) -> Iterator[Problem]:
-    for section, known in ("design", tuple(plant.design)), ("plant", plant.uncertain):
+    for section, known in plant.uncertain.items():
         for name in getattr(uncertainty, section):
             if name not in known:
                 path = "uncertainty", section, name

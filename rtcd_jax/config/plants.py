@@ -41,8 +41,8 @@ class PlantConfig(Settings):
         raise NotImplementedError
 
     @property
-    def uncertain(self) -> tuple[str, ...]:
-        """The constants that may be uncertain: all but the motors' limits."""
+    def uncertain(self) -> dict[str, tuple[str, ...]]:
+        """What may be uncertain of `design` and of the `plant`'s constants: all but the motors' limits."""
         raise NotImplementedError
 
 
@@ -78,10 +78,14 @@ class RobotPlant(PlantConfig):
         return {named.name: named.unit for named in self.robot().design}
 
     @property
-    def uncertain(self) -> tuple[str, ...]:
+    def uncertain(self) -> dict[str, tuple[str, ...]]:
         robot = self.robot()
         limits = {name for limit in robot.limits for name in needs(limit)}
-        return tuple(named.name for named in robot.constants if named.name not in limits)
+        sections = {"design": robot.design, "plant": robot.constants}
+        return {
+            section: tuple(named.name for named in names if named.name not in limits)
+            for section, names in sections.items()
+        }
 
 
 def _entries(value: Any) -> Any:
@@ -103,7 +107,7 @@ def _value(value: Any) -> Value:
 def _limit(value: Any) -> Value:
     value = _value(value)
     if not isinstance(value, str) and value <= 0:
-        raise refusal("must be > 0, or arithmetic of constants")
+        raise refusal("must be > 0, or arithmetic of constants and designs")
     return value
 
 
@@ -118,7 +122,7 @@ class InputConfig(Settings):
     """What the MJCF does not say of a motor."""
 
     limit: Annotated[Any, PlainValidator(_limit)] = Field(
-        description="largest |u|, a number or arithmetic of constants [input's unit]"
+        description="largest |u|, a number or arithmetic of constants and designs [input's unit]"
     )
 
 
@@ -255,10 +259,9 @@ class MjcfPlant(RobotPlant):
             if motor.name not in self.inputs and motor.limit is None:
                 text = "is missing: the MJCF's motor has no ctrlrange from -F to F, so say `limit: F`"
                 yield Problem(("inputs", motor.name, "limit"), text)
-        known = {name for name, each in self.constants.items() if not isinstance(each.value, str)}
         for name, each in self.inputs.items():
-            if others := [other for other in needs(each.limit) if other not in known]:
-                text = f"names {others[0]}: a motor's limit is a number or arithmetic of constants that are numbers"
+            if derived := [other for other in needs(each.limit) if other in self._derived()]:
+                text = f"names {derived[0]}: a motor's limit is arithmetic of designs and of constants that are numbers"
                 yield Problem(("inputs", name, "limit"), text, each.limit)
 
     def _derived(self) -> dict[str, str]:
@@ -282,9 +285,8 @@ class MjcfPlant(RobotPlant):
         known = {name: of_input.get(name, "") for name in self.values()}
         known |= {name: each.unit for name, each in self.constants.items()}
         of_set = (value for fields in self.set.values() for values in fields.values() for value in values)
-        used = dict.fromkeys(
-            name for value in (*of_set, *derived.values()) for name in needs(value) if name not in known
-        )
+        arithmetic = (*of_set, *derived.values(), *limits.values())
+        used = dict.fromkeys(name for value in arithmetic for name in needs(value) if name not in known)
         zeros = ", ".join(
             f"{joint.name} and {joint.name}_dot along its {'turning' if joint.hinge else 'sliding'} axis"
             for joint in names.joints
@@ -361,9 +363,9 @@ class PythonPlant(PlantConfig):
         return self.plant().design_units
 
     @property
-    def uncertain(self) -> tuple[str, ...]:
+    def uncertain(self) -> dict[str, tuple[str, ...]]:
         fields = self.plant().__dataclass_fields__
-        return tuple(name for name in fields if not name.endswith("_limit"))
+        return {"design": tuple(self.design), "plant": tuple(name for name in fields if not name.endswith("_limit"))}
 
 
 @cache

@@ -40,10 +40,9 @@ class Plant(eqx.Module):
     def m(self) -> int:
         return len(self.input_names)
 
-    @property
     @abc.abstractmethod
-    def input_limit(self) -> tuple[float, ...]:
-        """Largest |u_i| of every input, in `input_units`."""
+    def input_limits(self, design: eqx.Module) -> tuple[float | Float[Array, "*batch"], ...]:
+        """Largest |u_i| of every input, in `input_units`; floats if they do not depend on the design."""
 
     @abc.abstractmethod
     def dynamics(

@@ -23,9 +23,8 @@ class MjcfPlant(Plant):
 
     robot: ClassVar[Robot]
 
-    @property
-    def input_limit(self) -> tuple[float, ...]:
-        return tuple(value_of(limit, vars(self)) for limit in self.robot.limits)
+    def input_limits(self, design: eqx.Module) -> tuple[float | Float[Array, "*batch"], ...]:
+        return tuple(value_of(limit, vars(self) | vars(design)) for limit in self.robot.limits)
 
     def dynamics(
         self, design: eqx.Module, x: Float[Array, "n *batch"] | Components, u: Float[Array, "m *batch"] | Components

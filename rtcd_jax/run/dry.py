@@ -17,7 +17,7 @@ def understood(problem: Problem) -> Iterator[str]:
     yield f"robot      {problem.config.plant.name}: {plant.convention}"
     bounds = zip(plant.state_names, plant.state_units, problem.state_limits, strict=True)
     yield "states     " + ", ".join(f"|{name}| <= {limit:.6g} {unit}" for name, unit, limit in bounds)
-    inputs = zip(plant.input_names, plant.input_units, problem.input_limits, strict=True)
+    inputs = zip(plant.input_names, plant.input_units, np.asarray(problem.input_limits(design)), strict=True)
     yield "inputs     " + ", ".join(f"|{name}| <= {limit:.6g} {unit}" for name, unit, limit in inputs)
     units = plant.parameter_units
     numbers = (f"{name} = {value:.6g} {units[name]}".rstrip() for name, value in plant.parameters(design).items())

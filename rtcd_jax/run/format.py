@@ -38,7 +38,7 @@ def arrays_of(problem: Problem, evaluation: Evaluation) -> dict[str, np.ndarray]
         "R": np.diag(host.candidate.r),
         "K_goal": policy.gains[-1],
         "x_goal": problem.goal,
-        "u_max": problem.input_limits,
+        "u_max": np.asarray(problem.input_limits(host.candidate.design)),
         "volumes_per_knot": volumes.per_knot,
         "pushes": _pushes(problem, evaluation)[0],
         **{f"volumes_{name}": volumes[name] for name in VOLUMES},

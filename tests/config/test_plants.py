@@ -55,7 +55,7 @@ def test_a_robot_is_read_from_the_mjcf_beside_its_configuration(written):
     assert config.plant.states == {"shoulder": "rad", "elbow": "rad", "shoulder_dot": "rad/s", "elbow_dot": "rad/s"}
     assert config.plant.input_units == {"torque": "N m"}
     assert config.design_units == {"upper_length": "m", "lower_mass": "kg"}
-    assert config.plant.uncertain == ("gravity",)
+    assert config.plant.uncertain == {"design": ("upper_length", "lower_mass"), "plant": ("gravity",)}
 
 
 def test_the_resolved_configuration_stands_alone(written):
@@ -74,6 +74,15 @@ def test_a_number_of_the_model_is_its_arithmetic(written):
     assert robot.units["upper_length"] == "m"
 
 
+def test_a_motor_s_limit_may_be_a_design_whose_uncertainty_is_the_input_limit_s(written):
+    motor = ("limit: 6", "limit: 2*motor"), ("\ntask", "\n  motor: {initial: 3, min: 1, max: 4, unit: N m}\ntask")
+    config = written(*motor)
+    assert config.design_units["motor"] == "N m"
+    assert config.plant.uncertain["design"] == ("upper_length", "lower_mass")
+    with pytest.raises(ConfigError, match=r"uncertainty.design.motor: must be a design parameter"):
+        written(*motor, ("\ntask", "\nuncertainty: {design: {motor: 0.1}}\ntask"))
+
+
 @pytest.mark.parametrize(
     ("replacement", "words"),
     [
@@ -90,8 +99,8 @@ def test_a_number_of_the_model_is_its_arithmetic(written):
         (("torque: {limit: 6}", "force: {limit: 6}"), r"plant.inputs.force: is no motor of the MJCF; .*torque"),
         (("limit: 6", "limit: 0"), r"plant.inputs.torque.limit = 0: must be"),
         (
-            ("limit: 6", "limit: upper_length"),
-            r"plant.inputs.torque.limit = 'upper_length': names upper_length: a motor",
+            ("limit: 6", "limit: half"),
+            r"plant.inputs.torque.limit = 'half': names half: a motor",
         ),
         (("inputs: {torque: {limit: 6}}", "inputs: {}"), r"plant.inputs.torque.limit: is missing: .*no ctrlrange"),
         (

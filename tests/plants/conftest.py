@@ -59,9 +59,10 @@ def _random_robot(name: str) -> Robot:
     plant = packaged(name, **constants)
     design = load(next(CONFIGS.glob(f"{name}*.yaml"))).design
     fields = {key: jnp.asarray(variable.initial * random.uniform(0.7, 1.3, STATES)) for key, variable in design.items()}
+    robot = plant.Design(**fields)
     x = jnp.asarray(random.uniform(-4, 4, (STATES, plant.n)))
-    u = jnp.asarray(random.uniform(-1, 1, (STATES, plant.m)) * np.asarray(plant.input_limit))
-    return Robot(name, plant, plant.Design(**fields), x, u)
+    u = jnp.asarray(random.uniform(-1, 1, (STATES, plant.m)) * np.asarray(plant.input_limits(robot)))
+    return Robot(name, plant, robot, x, u)
 
 
 @pytest.fixture(scope="session", params=PLANTS)

@@ -43,7 +43,7 @@ class Loops(eqx.Module):
     dt: Float[Array, " C"]
     goal: Float[Array, " n"]
     goal_shape: Float[Array, "C n n"]
-    input_limits: Float[Array, " m"]
+    input_limits: Float[Array, "C m"]
     state_limits: Float[Array, " n"]
     intervals: int = eqx.field(static=True)
 
@@ -56,27 +56,27 @@ class Loops(eqx.Module):
             dt=jnp.asarray([elite.time[1] for elite in elites]),
             goal=jnp.asarray(first.x_goal),
             goal_shape=jnp.asarray([elite.S[-1] / elite.rho[-1] for elite in elites]),
-            input_limits=jnp.asarray(first.u_max),
+            input_limits=jnp.asarray([elite.u_max for elite in elites]),
             state_limits=jnp.asarray(first.state_limits),
             intervals=len(first.u),
         )
 
     def law(self, which: Int[Array, " L"], t: Float[Array, ""], x: tuple) -> list:
         """u [m] x [L] = clip(u* - K (x - x*)) at time t."""
-        n, m = self.goal.size, self.input_limits.size
+        n, m = self.goal.size, self.input_limits.shape[1]
         place = t / self.dt[which]
         k = jnp.minimum(jnp.floor(place).astype(int), self.intervals)
         s = place - k
         row = self.rows[which * (self.intervals + 1) + k]
         cubics, gains, changes, feedforward = jnp.split(row, np.cumsum([4 * n, m * n, m * n]), axis=1)
-        error = []
+        limits, error = self.input_limits[which], []
         for i in range(n):
             c0, c1, c2, c3 = (cubics[:, 4 * i + power] for power in range(4))
             error.append(x[i] - (c0 + s * (c1 + s * (c2 + s * c3))))
         u = []
         for j in range(m):
             terms = ((gains[:, j * n + i] + s * changes[:, j * n + i]) * error[i] for i in range(n))
-            u.append(jnp.clip(feedforward[:, j] - sum(terms), -self.input_limits[j], self.input_limits[j]))
+            u.append(jnp.clip(feedforward[:, j] - sum(terms), -limits[:, j], limits[:, j]))
         return u
 
     def inside(self, x: Float[Array, "n L"]) -> Bool[Array, " L"]:
@@ -187,7 +187,7 @@ def advance(loops: Loops, rollouts: Rollouts, motion: Motion, first: Int[Array, 
         past = motion.past.at[index % len(motion.past)].set(motion.x)
         command, noise = _decide(loops, rollouts, motion, past, index, key, noisy)
         given = motion.input + follow * (command - motion.input)
-        bound = rollouts.actuator_scale * loops.input_limits[:, None]
+        bound = rollouts.actuator_scale * loops.input_limits[rollouts.loop].T
         pushed = jnp.clip(given + noise, -bound, bound) + _pushes(rollouts, t + STEP / 2)
         rubbing = jax.lax.cond(rubs, lambda: _friction(rollouts, motion.x), lambda: free)
         x = rk4_step(slope, split(motion.x), pushed - rubbing, STEP)
@@ -201,7 +201,7 @@ def _decide(loops: Loops, rollouts: Rollouts, motion: Motion, past, index, key, 
     """What the controllers ask for after step `index`, and the motors' noise: new where a control period begins."""
     count = len(rollouts.loop)
     measured = past[(index - rollouts.delay) % len(past), :, jnp.arange(count)].T
-    m, half = loops.input_limits.size, loops.goal.size // 2
+    m, half = loops.input_limits.shape[1], loops.goal.size // 2
 
     def draw():
         return jax.random.normal(jax.random.fold_in(key, index), (half + m, count))

@@ -169,7 +169,7 @@ def claimed_robot(elite: Elite) -> ClaimedRobot:
     description = _described(robot, form.equations, symbols, numbers)
     used = check.numbers_of(description)
     names = {named.name: named.symbol for named in (*robot.design, *robot.constants)}
-    uncertain = (*(named.name for named in robot.design), *config.uncertain)
+    uncertain = tuple(name for names in config.uncertain.values() for name in names)
     return ClaimedRobot(
         description,
         {name: value for name, value in numbers.items() if name in used},
