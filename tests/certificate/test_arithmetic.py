@@ -124,6 +124,16 @@ def test_remainders_that_vanish_with_the_level():
                     assert error <= float(product.r) * level + float(product.d) + 1e-15
 
 
+def test_what_is_rounded_vanishes_with_the_level_only_where_its_term_does():
+    """A third of y, without l, is not the model's multiple of 2^-80 at l = 0 either."""
+    third = Taylor(SPACE, polynomial(2, {(0, 1, 0): Q(1, 3)})).tidy()
+    off = abs(fraction(dict(check.terms_of(third.p))[0, 1, 0]) - Fraction(1, 3))
+    assert 0 < off <= fraction(third.d)
+    with_level = Taylor(SPACE, polynomial(2, {(1, 1, 0): Q(1, 3)})).tidy()
+    assert 0 < off <= fraction(with_level.r)
+    assert with_level.d == 0
+
+
 def test_reduction_to_the_sphere():
     angle = 0.7
     y = np.array([np.cos(angle), np.sin(angle)])

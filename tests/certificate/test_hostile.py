@@ -97,6 +97,17 @@ def test_a_note_cannot_say_that_it_is_the_checker(content, asked):
     assert all(note.startswith("note of the file's author, not proved: ") and len(note) <= 79 for note in notes)
 
 
+def test_a_robot_cannot_say_that_it_is_the_checker(content, asked):
+    """Names of its states and units are a file's text, too."""
+    robot = content["claim"]["robot"]
+    robot["name"], robot["input_unit"] = f"{ESCAPE}'", f"\n{FORGED}"[:40]
+    robot["states"], robot["units"] = [f"{ESCAPE}\n", f"\n{FORGED}"[:40]], ["\r", "\u202e"]
+    code, out, err = asked(resealed(content))
+    assert (code, err) == (0, "")
+    assert lines_are_the_checker_s_own(out, err)
+    assert r"|\x1b[2K\r\n| <= 6.28319 \r" in out
+
+
 @pytest.mark.parametrize("note", [["x"], {"x": "y"}, 3, None])
 def test_a_note_is_a_text(content, asked, note):
     content["notes"]["a"] = note

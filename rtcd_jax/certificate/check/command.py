@@ -34,7 +34,7 @@ def main(arguments: Sequence[str]) -> int:
         print(USAGE)
         return 0
     try:
-        file, seconds, lab = _options(arguments)
+        file, seconds, lab = options_of(arguments)
     except ValueError as error:
         print(f"rtcd check: {printable(error)}", file=sys.stderr)
         return 2
@@ -63,7 +63,7 @@ def main(arguments: Sequence[str]) -> int:
     return 0
 
 
-def _options(arguments: Sequence[str]) -> tuple[str, float, str | None]:
+def options_of(arguments: Sequence[str]) -> tuple[str, float, str | None]:
     """The file, the seconds and the controller's folder. Raises ValueError, which says what would have been right."""
     files: list[str] = []
     given: dict[str, str] = {}

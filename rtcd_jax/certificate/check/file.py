@@ -4,7 +4,7 @@ import hashlib
 import json
 import math
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -237,30 +237,33 @@ def read_robot(node: Node) -> Robot:
     rows = [row.items(i + 1) for i, row in enumerate(mass.items(count))]
 
     def constants(each: Node) -> tuple[Function, ...]:
-        found = tuple(_read_function(entry, count) for entry in each.items(count))
+        found = tuple(_read_function(entry, kinds) for entry in each.items(count))
         each.require(not any(any(term.joints) for function in found for term in function), "must not move")
         return found
 
     return Robot(
         name.text(), states.texts(2 * count), units.texts(2 * count), input_unit.text(), kinds,
-        tuple(tuple(_read_function(entry, count) for entry in row) for row in rows),
-        _read_function(potential, count), constants(damping), constants(motor),
+        tuple(tuple(_read_function(entry, kinds) for entry in row) for row in rows),
+        _read_function(potential, kinds), constants(damping), constants(motor),
     )  # fmt: skip
 
 
-def _read_function(node: Node, joints: int) -> Function:
+def _read_function(node: Node, kinds: Sequence[str]) -> Function:
     terms = node.items()
     node.require(len(terms) <= MOST_TERMS_OF_ROBOT, f"must have at most {MOST_TERMS_OF_ROBOT} terms")
-    return tuple(_read_term(term, joints) for term in terms)
+    return tuple(_read_term(term, kinds) for term in terms)
 
 
-def _read_term(node: Node, joints: int) -> Term:
+def _read_term(node: Node, kinds: Sequence[str]) -> Term:
     node.require(isinstance(node.value, dict) and node.value.keys() == {"joints", "powers", "cos", "sin"},
                  "must have joints, powers, cos and sin")  # fmt: skip
     at, powers, cosine, sine = (
         Node(f"{node.place}.{key}", node.value[key]) for key in ("joints", "powers", "cos", "sin")
     )
-    places = tuple(each.integer(-HIGHEST, HIGHEST) for each in at.items(joints))
+    places = tuple(
+        each.integer(-HIGHEST if kind == HINGE else 0, HIGHEST)
+        for each, kind in zip(at.items(len(kinds)), kinds, strict=True)
+    )
     by_name = tuple(sorted((name, power.integer(1, HIGHEST)) for name, power in powers.named()))
     return Term(places, by_name, cosine.number(), sine.number())
 

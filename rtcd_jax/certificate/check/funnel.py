@@ -86,7 +86,7 @@ def funnel_obligations(claim: Claim, interval: Interval, place: str) -> dict[str
     x = [Taylor(space, center + e).tidy() for center, e in zip(data.state, error, strict=True)]
     field = field_of(claim, x, waves_near(claim, x, place), place)
     scaled = [dot(column, y) for column in zip(*adjugate, strict=True)]
-    push = pushes(field, scaled, Taylor(space, determinant).constant)
+    push = pushes(field, scaled, Taylor(space, determinant).constant, place)
     drag = [Taylor(space, a + dot(row, y)).tidy() for a, row in zip(data.rate, data.axes_rate, strict=True)]
     relative = [a - field.d * slow for a, slow in zip(field.a, drag, strict=True)]
     free, forced = pushed(push, relative), pushed(push, field.b)
@@ -161,9 +161,11 @@ def waves_near(claim: Claim, x: list[Taylor], place: str) -> dict[tuple[int, ...
     return values
 
 
-def pushes(field: Field, scaled: list, determinant) -> list[Taylor]:
-    """The vector c adj(L)'y, of which `scaled` lacks the constant c."""
-    scale, _ = near(2 / (field.d.constant * determinant), 30)
+def pushes(field: Field, scaled: list, determinant, place: str) -> list[Taylor]:
+    """The vector c adj(L)'y, of which `scaled` lacks the constant c > 0."""
+    middle = field.d.constant * determinant
+    require(middle > 0, place, "the mass matrix' determinant is not shown to be positive here")
+    scale, _ = near(2 / middle, 30)
     wide = field.d.space._replace(y_order=field.d.space.y_order + 1)
     return [Taylor(wide, each) * scale for each in scaled]
 

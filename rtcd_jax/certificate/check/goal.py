@@ -57,7 +57,7 @@ def goal_field(claim: Claim, axes: list, y_order: int, place: str, row: list) ->
     z = [field.d.space.y(i) for i in range(claim.n)]
     still = all(any(e[: claim.n + 1]) for f in field.a for e, _ in terms_of(f.p))
     require(still, place, "the goal is no equilibrium")
-    push = pushes(field, [dot(z, column) for column in zip(*adjugate, strict=True)], determinant)
+    push = pushes(field, [dot(z, column) for column in zip(*adjugate, strict=True)], determinant, place)
     gain = [dot(claim.K_goal, column) for column in zip(*axes, strict=True)]
     late, older = error_under(claim, [claim.K_goal]), None
     if claim.first_order:

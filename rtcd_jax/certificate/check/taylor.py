@@ -109,10 +109,10 @@ class Taylor:
                 coefficient, error = Q(0), abs(c)
             else:
                 coefficient, error = near(c)
-            if error != 0 and order:
+            if error != 0 and e[0]:
                 r += error * peak(e[1 : n + 1])
             elif error != 0:
-                d += error
+                d += error * peak(e[1 : n + 1])
             if coefficient != 0:
                 terms[e] = coefficient
         return Taylor(self.space, self.space.polynomial(terms), up(r), up(d))

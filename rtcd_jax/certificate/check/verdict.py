@@ -22,6 +22,7 @@ from rtcd_jax.certificate.check.funnel import Interval, funnel_obligations, moti
 from rtcd_jax.certificate.check.goal import goal_field, goal_obligations, require_arrival
 from rtcd_jax.certificate.check.matrix import cofactors, dot
 from rtcd_jax.certificate.check.push import require_push
+from rtcd_jax.certificate.check.robot import Robot
 from rtcd_jax.certificate.check.squares import GramCertificate, Obligation, margin
 from rtcd_jax.certificate.check.taylor import terms_of
 
@@ -170,7 +171,8 @@ def total(values: Sequence[float]) -> float:
 
 
 def sentence(report: Report) -> str:
-    """What is proved, in plain words."""
+    """What is proved, in plain words on one line of ASCII, whatever the file calls its robot's states."""
+    report = report._replace(claim=_printable(report.claim))
     claim, robot, v = report.claim, report.claim.robot, report.volumes
     unit = " ".join(robot.units)
 
@@ -208,13 +210,20 @@ def sentence(report: Report) -> str:
     )
 
 
+def _printable(claim: Claim) -> Claim:
+    """The same claim with a robot whose texts a terminal only shows."""
+    name, states, units, input_unit = claim.robot[:4]
+    texts = printable(name), tuple(map(printable, states)), tuple(map(printable, units)), printable(input_unit)
+    return claim._replace(equations=claim.equations._replace(robot=Robot(*texts, *claim.robot[4:])))
+
+
 def _robots(claim: Claim) -> str:
     """The model or models, with their numbers."""
     texts = []
     for name, (low, high) in claim.parameters.items():
         a, b = f"{rounded(low):.6g}", f"{rounded(high):.6g}"
         texts.append(f"{printable(name)} = {a}" if low == high else f"{printable(name)} in [{a}, {b}]")
-    name, numbers = printable(claim.robot.name), ", ".join(texts)
+    name, numbers = claim.robot.name, ", ".join(texts)
     if not claim.uncertain:
         return f"the model {name!r} ({numbers}; SI units)"
     in_time = "constant" if claim.first_order else "constant or varying"
