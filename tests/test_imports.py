@@ -81,6 +81,7 @@ QUICK = (
     "system.errors",
     "volume",
     "certificate.check",
+    "certificate.check_cpp.command",
 )
 HEAVY = {"jax", "jaxtyping", "equinox", "evosax", "mujoco", "orbax", "scipy", "numpy", "matplotlib", "cvxpy"}
 

@@ -11,7 +11,6 @@ import hashlib
 import itertools
 import json
 import math
-import os
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field
@@ -27,7 +26,7 @@ from rtcd_jax.certificate.prove.closed_loop import claim_of
 from rtcd_jax.certificate.prove.robot import ClaimedRobot, claimed_robot
 from rtcd_jax.elite.elite import Elite
 from rtcd_jax.system.errors import UserError, printable
-from rtcd_jax.system.files import replace_json
+from rtcd_jax.system.files import replace_json, user_cache
 
 RATE_ROUNDING = 1e-12
 """Share of the largest rate by which another machine's sine may change one."""
@@ -243,10 +242,7 @@ def _remembered(digest: str) -> Standing | None:
 
 
 def _cached(digest: str) -> Path:
-    """In `$XDG_CACHE_HOME`, by default ~/.cache."""
-    given = Path(os.environ.get("XDG_CACHE_HOME", ""))
-    folder = given if given.is_absolute() else Path(os.path.expanduser("~/.cache"))
-    return folder / "rtcd_jax" / "verdicts" / f"{digest}-{checker_digest()}.json"
+    return user_cache() / "verdicts" / f"{digest}-{checker_digest()}.json"
 
 
 @cache

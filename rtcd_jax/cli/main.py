@@ -113,7 +113,8 @@ VERBS = {
         jax=True,
     ),
     "check": Verb(
-        "rtcd_jax.certificate.check:main", "check a certificate file by exact arithmetic, without any solver"
+        "rtcd_jax.certificate.check_cpp.command:main",
+        "check a certificate file by exact arithmetic, without any solver",
     ),
     "falsify": Verb(
         "rtcd_jax.cli.run_verbs:falsify", "simulate a great many motions of what a certificate says is proved"

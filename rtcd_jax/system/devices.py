@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from rtcd_jax.system.errors import UserError
+from rtcd_jax.system.files import user_cache
 
 CPU_FLAGS = (
     "--xla_cpu_prefer_vector_width=512",  # twice as fast with AVX-512
@@ -64,9 +65,8 @@ def _has_cuda() -> bool:
 
 
 def default_cache() -> str:
-    """`rtcd_jax/xla` in the user's folder for caches, $XDG_CACHE_HOME or ~/.cache."""
-    base = os.environ.get("XDG_CACHE_HOME") or os.path.join(os.path.expanduser("~"), ".cache")
-    return os.path.join(base, "rtcd_jax", "xla")
+    """`xla` in the user's cache."""
+    return str(user_cache() / "xla")
 
 
 def _keep_programs(folder: str) -> None:

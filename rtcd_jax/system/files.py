@@ -31,6 +31,12 @@ def plain(value: Any) -> Any:
     raise TypeError(f"JSON has no {type(value).__name__}: {value!r}")
 
 
+def user_cache() -> Path:
+    """`rtcd_jax` in the user's folder for caches, `$XDG_CACHE_HOME` or ~/.cache."""
+    given = Path(os.environ.get("XDG_CACHE_HOME", ""))
+    return (given if given.is_absolute() else Path(os.path.expanduser("~/.cache"))) / "rtcd_jax"
+
+
 def make_folder(path: Path) -> None:
     """Makes a folder, with its parents, where it is not there. Raises `UserError` if nothing can be written into it."""
     with writing(path):

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from rtcd_jax.certificate import check
+from rtcd_jax.certificate.check.exact import MAX_BYTES, rounded
 from rtcd_jax.cli import main as cli
 from tests.certificate import swing
 from tests.certificate.folder import folder_with
@@ -80,9 +81,9 @@ def test_numbers_that_no_double_holds_are_refused_in_one_line(content, asked, nu
 
 def test_volumes_beyond_all_doubles_are_infinite():
     assert check.verdict.total([1.7e308, 1.7e308]) == float("inf")
-    assert check.exact.rounded(check.Q(10**400)) == float("inf")
-    assert check.exact.rounded(check.Q(-(10**400), 3)) == -float("inf")
-    assert check.exact.rounded(check.Q(1, 10**400)) == 0
+    assert rounded(check.Q(10**400)) == float("inf")
+    assert rounded(check.Q(-(10**400), 3)) == -float("inf")
+    assert rounded(check.Q(1, 10**400)) == 0
 
 
 def test_a_note_cannot_say_that_it_is_the_checker(content, asked):
@@ -138,7 +139,7 @@ def test_deep_nesting_is_refused(content, asked, depth, pair, place):
 def test_too_large_a_file_is_undecided(asked, tmp_path, capsys):
     path = tmp_path / "large.json"
     with path.open("wb") as file:
-        file.truncate(check.exact.MAX_BYTES + 1)
+        file.truncate(MAX_BYTES + 1)
     assert check.main([str(path)]) == 2
     assert "large.json: has more than 134217728 bytes: undecided" in capsys.readouterr().err
 
