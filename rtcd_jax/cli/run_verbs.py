@@ -366,9 +366,11 @@ class AuditOptions(Options):
     """
 
     file: Annotated[Positional[Path], shown("FILE")] = Field(description="the trajectory and its funnel")
-    plant: str = Field(description="pendulum or cartpole")
+    plant: Annotated[str, shown("NAME|YAML")] = Field(
+        description="a packaged robot with one motor, or a configuration whose robot it is"
+    )
     parameters: Annotated[tuple[Annotated[str, AfterValidator(_assignment)], ...], shown("NAME=VALUE …")] = Field(
-        description="its physical numbers [SI]"
+        description="its physical numbers; of a configuration's robot, those that are other than the file's [SI]"
     )
     q: tuple[float, ...] = Field(description="diagonal of the cost's Q [1/(s state's unit^2)]")
     r: float = Field(description="the cost's R [1/(s input's unit^2)]")

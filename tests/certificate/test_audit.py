@@ -11,18 +11,25 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import yaml
 
 from rtcd_jax.analysis.disturb.comparison import read_comparison
 from rtcd_jax.certificate import check
 from rtcd_jax.certificate.audit.external import Cost, elite_of, read_external
 from rtcd_jax.certificate.audit.projection import defects, projected, with_fitting_inputs
+from rtcd_jax.certificate.prove.closed_loop import claim_of
+from rtcd_jax.certificate.prove.robot import robot_of
 from rtcd_jax.cli import main as cli
+from rtcd_jax.config.plants import PLANTS, ROBOTS, read_plant
+from rtcd_jax.elite.elite import Elite
 from rtcd_jax.elite.records import read_elite
 from rtcd_jax.system.console import silent
 from rtcd_jax.system.errors import UserError
 from rtcd_jax.volume import VOLUMES, Volume
 from tests.analysis.replay.test_measured import mutated
-from tests.certificate import swing
+from tests.certificate import swing, upright
+from tests.paths import CONFIGS
+from tests.plants.trees import SWING, link, mjcf
 
 HEADINGS = "time_s,theta_rad,theta_dot_rad_s,torque_Nm,rho,S11,S12,S22"
 ARGUMENTS = [
@@ -128,6 +135,80 @@ def test_an_immodest_funnel_is_found_out_knot_by_knot(tmp_path, capsys):
     arrays, record = read_elite(out / "elites", "001")
     assert arrays["rho"][0] == 400
     assert record["state_limits"] == [None, None]
+
+
+# Other robots ---------------------------------------------------------------------------------------------------------
+
+
+def table_of(path, arrays, rho):
+    """An elite's motion as a table, under levels of one's own."""
+    rows, places = np.triu_indices(arrays["x"].shape[1])
+    held = np.append(arrays["u"][:, 0], math.nan)
+    levels, s = np.full(len(held), rho), arrays["S"][:, rows, places]
+    columns = np.column_stack([arrays["time"], arrays["x"], held, levels, s]).tolist()
+    path.write_text("\n".join(["headings", *(",".join(map(repr, row)) for row in columns)]))
+    return path
+
+
+def arguments_of(arrays, record, plant):
+    numbers = [f"{name}={value!r}" for name, value in record["parameters"].items()]
+    q, r = np.diag(arrays["Q"]), arrays["R"][0, 0]
+    return ["--plant", str(plant), "--parameters", *numbers, "--q", *map(repr, q.tolist()), "--r", repr(float(r))]
+
+
+def audited_without_faults(tmp_path, arrays, record, plant, rho):
+    out, path = tmp_path / "out", table_of(tmp_path / "x.csv", arrays, rho)
+    command = ["audit", str(path), *arguments_of(arrays, record, plant), "--states", "20", "--out", str(out)]
+    assert cli.main(command) == 0
+    assert max(json.loads((out / "audit.json").read_text())["largest_defect"]) < 1e-7
+    return Elite.read(out, "000")
+
+
+@pytest.mark.parametrize("name", ["acrobot", "furuta", "reaction_wheel"])
+def test_the_funnel_of_any_packaged_robot_is_audited(tmp_path, name):
+    """Its elite is the robot's, bit by bit, and has a claim."""
+    arrays, record = upright.elite(name, inputs=(0.05, 0.02), dt=0.005)
+    found = audited_without_faults(tmp_path, arrays, record, name, 1e-6)
+    assert found.plant == name
+    assert dict(found.parameters) == record["parameters"]
+    np.testing.assert_array_equal(found.u_max, arrays["u_max"])
+    assert claim_of(found)["robot"]["name"] == name
+
+
+def test_the_funnel_of_a_robot_of_one_s_own_is_audited(tmp_path, capsys):
+    """By the configuration that has it; constants that are not given are the file's."""
+    arrays, record = upright.elite("reaction_wheel", inputs=(0.05, 0.02), dt=0.005)
+    robot = PLANTS["reaction_wheel"]
+    (tmp_path / "wheel.xml").write_text(robot.xml)
+    section = yaml.safe_load((ROBOTS / "reaction_wheel.yaml").read_text())
+    plant = {"mjcf": "wheel.xml", "name": "wheel", **{key: section[key] for key in ("inputs", "set")}}
+    plant["constants"] = {name: {"value": each["value"]} for name, each in section["constants"].items()}
+    config = yaml.safe_load((CONFIGS / "reaction_wheel.yaml").read_text())
+    config = {key: config[key] for key in ("task", "weights", "trajectory")} | {"plant": plant}
+    config["design"] = {
+        name: {"initial": record["parameters"][name], "min": 0.01, "max": 1, "unit": each["unit"]}
+        for name, each in section["design"].items()
+    }
+    file = tmp_path / "wheel.yaml"
+    file.write_text(yaml.safe_dump(config))
+    record["parameters"] = {name: record["parameters"][name] for name in section["design"]}
+    found = audited_without_faults(tmp_path, arrays, record, file, 1e-6)
+    assert found.plant == "wheel"
+    assert found.parameters["mass"] == section["constants"]["mass"]["value"]
+    assert claim_of(found)["robot"]["name"] == "wheel"
+    wrong = arguments_of(arrays, {"parameters": {"length": 0.1, "size": 1.0}}, file)
+    assert cli.main(["audit", str(tmp_path / "x.csv"), *wrong, "--out", str(tmp_path / "other")]) == 2
+    assert "differ in size, wheel_mass, wheel_radius" in capsys.readouterr().err
+
+
+def test_a_robot_of_two_motors_has_no_claim():
+    both = mjcf(
+        link("first", SWING, link("second", SWING, place="0 0 -0.3")),
+        *(f'name="{name}" joint="{name}" ctrllimited="true" ctrlrange="-1 1"' for name in ("first", "second")),
+    )
+    plant = read_plant({"mjcf": "two.xml", "xml": both})
+    with pytest.raises(UserError, match="no certificate for 2 inputs: the checker knows loops with one"):
+        robot_of(plant, plant.values(), {})
 
 
 def without(word):

@@ -147,7 +147,7 @@ def _inputs(misfits: Mapping[str, float], given: ExternalFunnel) -> list[str]:
 def _summary(
     given: ExternalFunnel, solution: ExternalFunnel, result: Escapes, off: np.ndarray, states: int
 ) -> list[str]:
-    names, intervals = given.plant.robot.states, len(given.u)
+    names, intervals = given.states, len(given.u)
     moved = np.max(np.abs(solution.x - given.x), axis=0)
 
     def by_state(numbers: np.ndarray) -> str:

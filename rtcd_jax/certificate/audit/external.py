@@ -13,8 +13,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from rtcd_jax.certificate.check import PLANTS, Plant
-from rtcd_jax.certificate.prove.closed_loop import linear
+from rtcd_jax.certificate.prove.closed_loop import linear, rate
+from rtcd_jax.certificate.prove.robot import ClaimedRobot, robot_of
+from rtcd_jax.config.load import load
+from rtcd_jax.config.plants import PLANTS, PackagedPlant, RobotPlant
 from rtcd_jax.elite.elite import CLAIMED
 from rtcd_jax.system.delimited import number_or_nan, read_table, shown
 from rtcd_jax.system.errors import UserError, closest, printable
@@ -26,19 +28,36 @@ SYMMETRIC = 0.05
 """Share of its largest entry by which S may be asymmetric, as integrated ones are; V has its symmetric part only."""
 SMALLEST, LARGEST = 1e-12, 1e12
 """Ends of the numbers that a robot, a cost or a table may have [SI units]."""
-DAMPINGS = {"b", "Beq", "Bp"}
-"""Parameters that may be zero."""
 CONFIDENCE = 0.99
 """With which a verification must refute a claim, which is that no state fails."""
 AT_GOAL = 1e-3
 """How far the last state may be from the equilibrium that it stands for."""
 
 
+class ExternalRobot(NamedTuple):
+    """A robot of one motor: what a claim says of it, its configuration, stored parameters, and its design's units."""
+
+    claimed: ClaimedRobot
+    plant: RobotPlant
+    parameters: dict[str, float]
+    units: Mapping[str, str]
+
+    @property
+    def design(self) -> dict[str, float]:
+        """By the configuration's names."""
+        return {named.name: self.parameters[named.symbol] for named in self.plant.robot(self.units).design}
+
+    @property
+    def record(self) -> dict[str, Any]:
+        """What an elite's record says of it."""
+        own = {} if self.plant.name in PLANTS else {"robot": self.plant.model_dump(mode="json")}
+        return {"plant": self.plant.name, **own, "parameters": self.parameters}
+
+
 class ExternalFunnel(NamedTuple):
     """What files claim of a robot; `goal` is the equilibrium at its last knot, `inputs` the file's own, one a knot."""
 
-    name: str
-    parameters: dict[str, float]
+    robot: ExternalRobot
     dt: float
     x: Float[np.ndarray, "N+1 n"]
     u: Float[np.ndarray, " N"]
@@ -48,13 +67,21 @@ class ExternalFunnel(NamedTuple):
     inputs: Float[np.ndarray, " N+1"]
 
     @property
-    def plant(self) -> Plant:
-        return PLANTS[self.name]
+    def states(self) -> tuple[str, ...]:
+        return self.robot.claimed.description.states
 
     @property
     def limit(self) -> float:
         """Largest input."""
-        return self.parameters[self.plant.limit]
+        return self.robot.claimed.limit
+
+    def rate(self, x: np.ndarray, u: Any) -> np.ndarray:
+        """x' [n ...] at the states x [n ...]."""
+        return rate(self.robot.claimed.description, self.robot.claimed.numbers, x, u)
+
+    def linear(self, x: np.ndarray, u: float) -> tuple[np.ndarray, np.ndarray]:
+        """A [n n] and B [n] at x [n]."""
+        return linear(self.robot.claimed.description, self.robot.claimed.numbers, x, u)
 
     @property
     def volumes(self) -> np.ndarray:
@@ -65,17 +92,15 @@ class ExternalFunnel(NamedTuple):
 
 
 def read_external(path: Path, name: str, parameters: Mapping[str, float], funnel: Path | None = None) -> ExternalFunnel:
-    """The trajectory and funnel of one table, or of a trajectory and a `funnel` file.
+    """The trajectory and funnel of one table, or of a trajectory and a `funnel` file; `name` as `robot_named` has it.
 
     Raises:
-        UserError: an unknown plant or parameter, a number out of its range, or files that are not as the module says.
+        UserError: an unknown robot or parameter, a number out of its range, or files that are not as the module says.
     """
-    if name not in PLANTS:
-        raise UserError(f"--plant = {name!r}: unknown plant; {closest(name, tuple(PLANTS))}")
-    plant = PLANTS[name]
-    _require_parameters(plant, name, parameters)
-    n = len(plant.robot.states)
-    columns = f"time, {', '.join(plant.robot.states)}, input"
+    robot = robot_named(name, parameters)
+    states = robot.claimed.description.states
+    n = len(states)
+    columns = f"time, {', '.join(states)}, input"
     if funnel is None:
         entries = n * (n + 1) // 2
         table = _numbers(path, n + 3 + entries, f"{columns}, rho, upper triangle of S", last=n + 1)
@@ -92,9 +117,7 @@ def read_external(path: Path, name: str, parameters: Mapping[str, float], funnel
     for what, holds in (("rho", rho > 0), ("S", np.linalg.eigvalsh(s)[:, 0] > 0)):
         if not np.all(holds):
             raise UserError(f"{funnel or path}: {what} of knot {int(np.argmin(holds))} must be positive")
-    external = ExternalFunnel(
-        name, dict(parameters), float(dt), x, inputs[:-1], rho, s, _goal(path, plant, x[-1]), inputs
-    )
+    external = ExternalFunnel(robot, float(dt), x, inputs[:-1], rho, s, _goal(path, robot, x[-1]), inputs)
     with np.errstate(all="ignore"):
         sizes = np.isfinite(external.volumes) & (external.volumes > 0)
     if not np.all(sizes):
@@ -102,16 +125,50 @@ def read_external(path: Path, name: str, parameters: Mapping[str, float], funnel
     return external
 
 
-def _require_parameters(plant: Plant, name: str, parameters: Mapping[str, float]) -> None:
-    wrong = parameters.keys() ^ set(plant.parameters)
-    if wrong:
-        names, differ = ", ".join(plant.parameters), ", ".join(sorted(printable(key, 30) for key in wrong))
-        raise UserError(f"--parameters: must be those of the {name}, {names}; differ in {differ}")
-    for key, value in parameters.items():
-        may_be_zero = key in DAMPINGS
-        if not (SMALLEST <= value <= LARGEST or (may_be_zero and value == 0)):
+def robot_named(name: str, parameters: Mapping[str, float]) -> ExternalRobot:
+    """A packaged robot by its name, or that of a configuration's file, with these parameters by their stored names.
+
+    A packaged one needs all of them; of a file's, constants that are left out are the file's.
+
+    Raises:
+        UserError: none of that name, a wrong parameter, or a robot of which there is no claim.
+    """
+    if name in PLANTS:
+        plant, units = PLANTS[name](), {}
+    elif name.endswith((".yaml", ".yml")):
+        config = load(Path(name))
+        plant, units = config.plant, config.design_units
+    else:
+        raise UserError(
+            f"--plant = {name!r}: unknown plant; {closest(name, tuple(PLANTS))}; or a configuration, FILE.yaml"
+        )
+    if not isinstance(plant, RobotPlant):
+        raise UserError(f"--plant = {name!r}: its equations are a Python class's; a proof needs those of an MJCF")
+    given = _required(plant, units, parameters)
+    plant = plant.with_parameters(given)
+    return ExternalRobot(robot_of(plant, given, units), plant, given, units)
+
+
+def _required(plant: RobotPlant, units: Mapping[str, str], parameters: Mapping[str, float]) -> dict[str, float]:
+    """The parameters that are given, with constants of the file's that are not."""
+    robot, packaged = plant.robot(units), plant.packaged.constants if isinstance(plant, PackagedPlant) else None
+    constants = {named.symbol: plant.values()[named.name] for named in robot.constants} if packaged is None else {}
+    named = (*robot.design, *robot.constants, *((each for each, _ in robot.derived) if packaged is not None else ()))
+    known, given = [each.symbol for each in named], {**constants, **parameters}
+    if wrong := given.keys() ^ set(known):
+        differ = ", ".join(sorted(printable(key, 30) for key in wrong))
+        raise UserError(f"--parameters: must be those of the {plant.name}, {', '.join(known)}; differ in {differ}")
+    for each in named:
+        value = given[each.symbol]
+        if packaged is None:
+            least, holds = f"-{LARGEST:g}", abs(value) <= LARGEST
+        else:
+            may_be_zero = each.name in packaged and packaged[each.name].min == 0
             least = f"0, or {SMALLEST:g}" if may_be_zero else f"{SMALLEST:g}"
-            raise UserError(f"--parameters {key}={value}: must be a number from {least} to {LARGEST:g}")
+            holds = SMALLEST <= value <= LARGEST or (may_be_zero and value == 0)
+        if not holds:
+            raise UserError(f"--parameters {each.symbol}={value}: must be a number from {least} to {LARGEST:g}")
+    return {name: given[name] for name in known}
 
 
 def _numbers(path: Path, width: int, columns: str, last: int | None = None) -> np.ndarray:
@@ -165,10 +222,10 @@ def _levels_and_values(path: Path, knots: int, n: int) -> tuple[np.ndarray, np.n
     )
 
 
-def _goal(path: Path, plant: Plant, last: np.ndarray) -> np.ndarray:
+def _goal(path: Path, robot: ExternalRobot, last: np.ndarray) -> np.ndarray:
     """The equilibrium at the last state: at rest, the angle a multiple of pi."""
     goal = last.copy()
-    for i in plant.robot.hinges:
+    for i in robot.claimed.description.hinges:
         goal[i] = round(last[i] / math.pi) * math.pi
     goal[len(goal) // 2 :] = 0
     if np.max(np.abs(goal - last)) > AT_GOAL:
@@ -196,7 +253,7 @@ class Cost(NamedTuple):
             if len(values) != n or not all(
                 SMALLEST <= value <= (LARGEST if name == "q" else math.inf) for value in values
             ):
-                states = ", ".join(external.plant.robot.states)
+                states = ", ".join(external.states)
                 raise UserError(f"--{name} = {' '.join(map(str, values))}: must be {n} numbers > 0 ({states})")
         if not SMALLEST <= r <= LARGEST:
             raise UserError(f"--r = {r}: must be > 0 and at most {LARGEST:g}")
@@ -206,9 +263,7 @@ class Cost(NamedTuple):
 def elite_of(external: ExternalFunnel, cost: Cost) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     """Arrays and record as `elites/NNN` has them; the gains are R^-1 B'S, and the goal's those of the last knot."""
     inputs = np.append(external.u, 0.0)
-    jumps = np.array(
-        [linear(external.plant.robot, external.parameters, x, u)[1] for x, u in zip(external.x, inputs, strict=True)]
-    )
+    jumps = np.array([external.linear(x, u)[1] for x, u in zip(external.x, inputs, strict=True)])
     gains = [b @ s / cost.r for b, s in zip(jumps, external.S, strict=True)]
     volumes, pushes = external.volumes, largest_pushes(external.S, external.rho, jumps[:, :, None])
     at = Knots(volumes, np.log(volumes), pushes, external.dt)
@@ -221,8 +276,7 @@ def elite_of(external: ExternalFunnel, cost: Cost) -> tuple[dict[str, np.ndarray
         "volumes_per_knot": volumes, "pushes": pushes, **{f"volumes_{name}": value for name, value in named.items()},
     }  # fmt: skip
     record = {
-        "plant": external.name,
-        "parameters": external.parameters,
+        **external.robot.record,
         "weights": {"q": cost.q, "r": [cost.r]},
         "state_limits": [limit if math.isfinite(limit) else None for limit in cost.limits.tolist()],
         "status": "OK",

@@ -1,6 +1,5 @@
 """An audited funnel as a run folder, which every verb that reads runs reads: its configuration, and its elites."""
 
-import math
 from pathlib import Path
 from typing import Any
 
@@ -12,8 +11,6 @@ from rtcd_jax.system.files import make_folder, replace, replace_json
 
 AROUND = 10.0
 """Factor to each side of a weight's box: `rtcd optimize OUT/config.yaml` would search there."""
-ROD = 1 / 3
-"""A uniform rod's moment of inertia about its center of mass in Mp lp^2, lp half its length."""
 
 
 def config_of(external: ExternalFunnel, cost: Cost) -> Config:
@@ -21,18 +18,20 @@ def config_of(external: ExternalFunnel, cost: Cost) -> Config:
 
     Raises UserError as `configuration.parse`.
     """
-    plant, design = _robot(external.name, external.parameters)
+    robot = external.robot
+    pinned = {
+        name: {"initial": value, "min": value, "max": value, "pinned": True} for name, value in robot.design.items()
+    }
+    units = {name: {"unit": unit} for name, unit in robot.units.items() if unit}
     return configuration.parse(
         {
-            "plant": plant,
+            "plant": robot.plant.model_dump(mode="json"),
             "task": {
                 "start": external.x[0].tolist(),
                 "goal": external.goal.tolist(),
                 "state_limits": cost.limits.tolist(),
             },
-            "design": {
-                name: {"initial": value, "min": value, "max": value, "pinned": True} for name, value in design.items()
-            },
+            "design": {name: pinned[name] | units.get(name, {}) for name in pinned},
             "weights": {"q": [_searched(value) for value in cost.q.tolist()], "r": [_searched(cost.r)]},
             "trajectory": {"knots": len(external.x), "step": {"min": external.dt, "max": external.dt}},
         },
@@ -77,16 +76,3 @@ def units(config: Config) -> dict[str, Any]:
 
 def _searched(value: float) -> dict[str, Any]:
     return {"initial": value, "min": value / AROUND, "max": value * AROUND}
-
-
-def _robot(name: str, p: dict[str, float]) -> tuple[dict[str, Any], dict[str, float]]:
-    """The plant's section and its design, from the parameters of its equations."""
-    if name == "pendulum":
-        constants = {"damping": p["b"], "gravity": p["g"], "torque_limit": p["torque_limit"]}
-        return {"name": name} | constants, {"mass": p["m"], "length": p["l"]}
-    rod = math.isclose(p["inertia_about_com"], ROD * p["Mp"] * p["lp"] ** 2, rel_tol=1e-6)
-    constants = {
-        "cart_mass": p["Mc"], "cart_damping": p["Beq"], "pivot_damping": p["Bp"], "gravity": p["g"],
-        "force_limit": p["force_limit"], "inertia": "rod" if rod else "measured",
-    }  # fmt: skip
-    return {"name": name} | constants, {"pole_length": p["lp"], "pole_mass": p["Mp"]}

@@ -18,7 +18,6 @@ from scipy.integrate import solve_ivp
 from scipy.linalg import solve_continuous_are
 
 from rtcd_jax.certificate.audit.external import Cost, ExternalFunnel
-from rtcd_jax.certificate.prove.closed_loop import linear, rate
 from rtcd_jax.elite.closed_loop import runge_kutta_step
 from rtcd_jax.elite.funnel import riccati_rate
 from rtcd_jax.numerics.hermite import cubic_hermite
@@ -51,7 +50,7 @@ def flow(external: ExternalFunnel, x: np.ndarray, u: np.ndarray) -> Flow:
     held = u[:, None] + seeds.T[n, None, :]
     h = external.dt / SUBSTEPS
     for _ in range(SUBSTEPS):
-        state = runge_kutta_step(lambda _, x: rate(external.plant.robot, external.parameters, x, held), state, h)
+        state = runge_kutta_step(lambda _, x: external.rate(x, held), state, h)
     slopes = np.imag(state[:, :, :-1]) / step
     return Flow(np.real(state[:, :, -1]).T, np.moveaxis(slopes[:, :, :n], 0, 1), slopes[:, :, n].T)
 
@@ -149,16 +148,15 @@ def _linearized(x: np.ndarray, u: np.ndarray, now: Flow) -> tuple[Any, np.ndarra
 
 def tracking_values(external: ExternalFunnel, cost: Cost) -> np.ndarray:
     """S [N+1 n n] of the time-varying LQR along the motion, backward from the goal's own."""
-    robot, parameters = external.plant.robot, external.parameters
-    (a, b), q, r, n = linear(robot, parameters, external.goal, 0.0), np.diag(cost.q), cost.r, len(external.goal)
+    (a, b), q, r, n = external.linear(external.goal, 0.0), np.diag(cost.q), cost.r, len(external.goal)
     values = [solve_continuous_are(a, b[:, None], q, [[r]])]
     for k in range(len(external.u) - 1, -1, -1):
         ends, u = external.x[k : k + 2], external.u[k]
-        rates = [rate(robot, parameters, x, u) for x in ends]
+        rates = [external.rate(x, u) for x in ends]
 
         def backward(t: float, flat: np.ndarray, ends=ends, u=u, rates=rates) -> np.ndarray:
             x = cubic_hermite(1 - t / external.dt, external.dt, ends[0], rates[0], ends[1], rates[1])
-            a, b = linear(robot, parameters, x, u)
+            a, b = external.linear(x, u)
             return -riccati_rate(flat.reshape(n, n), a, b[:, None], q, np.array([r])).ravel()
 
         solution = solve_ivp(backward, (0, external.dt), values[0].ravel(), method="LSODA", rtol=1e-9, atol=1e-9)

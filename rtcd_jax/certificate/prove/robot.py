@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple, final
 
 from rtcd_jax.certificate import check
-from rtcd_jax.config.plants import RobotPlant
+from rtcd_jax.config.plants import PlantConfig, RobotPlant
 from rtcd_jax.config.robot import Robot, needs, value_of
 from rtcd_jax.elite.elite import Elite
 from rtcd_jax.plants.lagrange import Equations
@@ -103,14 +103,15 @@ class Polynomial:
 class ClaimedRobot(NamedTuple):
     """A robot as a claim says it.
 
-    `numbers` are the values of those in `description`; `limit` is the motor's. `names` has every number that a
-    configuration may call uncertain, with its name in a claim. `mixed` has those that are in arithmetic which is no
-    polynomial, with it. `derived` has the stored parameters that follow from others.
+    `numbers` are the values of those in `description`; `limit` is the motor's, `limit_name` its arithmetic. `names` has
+    every number that a configuration may call uncertain, with its name in a claim. `mixed` has those that are in
+    arithmetic which is no polynomial, with it. `derived` has the stored parameters that follow from others.
     """
 
     description: check.Robot
     numbers: dict[str, float]
     limit: float
+    limit_name: str
     names: dict[str, str]
     mixed: dict[str, str]
     derived: dict[str, Polynomial]
@@ -155,14 +156,25 @@ def claimed_robot(elite: Elite) -> ClaimedRobot:
     """
     if elite.u.shape[1] != 1:
         raise UserError(f"no certificate for {elite.u.shape[1]} inputs: the checker knows loops with one")
-    config = elite.robot
+    claimed = robot_of(elite.robot, elite.parameters, elite.design_units)
+    if float(elite.u_max[0]) != claimed.limit:
+        raise UserError(f"u_max = {elite.u_max[0]}: must be {claimed.limit_name} = {claimed.limit}")
+    return claimed
+
+
+def robot_of(config: PlantConfig, parameters: Mapping[str, float], units: Mapping[str, str]) -> ClaimedRobot:
+    """The robot of a configuration with these stored parameters; `units` are those of a design that has none.
+
+    Raises:
+        UserError: as `claimed_robot`.
+    """
     if not isinstance(config, RobotPlant):
-        raise UserError(f"no certificate for the {elite.plant}: its equations are a Python class's, no MJCF says them")
-    robot = config.with_parameters(elite.parameters).robot(elite.design_units)
-    values = {name: float(value) for name, value in robot.numbers(elite.parameters).items()}
+        raise UserError(f"no certificate for the {config.name}: its equations are a Python class's, no MJCF says them")
+    robot = config.with_parameters(parameters).robot(units)
+    if len(robot.inputs) != 1:
+        raise UserError(f"no certificate for {len(robot.inputs)} inputs: the checker knows loops with one")
+    values = {name: float(value) for name, value in robot.numbers(parameters).items()}
     limit = float(value_of(robot.limits[0], values))
-    if float(elite.u_max[0]) != limit:
-        raise UserError(f"u_max = {elite.u_max[0]}: must be {robot.limits[0]} = {limit}")
     polynomials, numbers, mixed = _polynomials(robot, values)
     form = closed_form(robot)
     symbols = [_expanded(text, polynomials, numbers, mixed, values) for text in form.symbols]
@@ -174,6 +186,7 @@ def claimed_robot(elite: Elite) -> ClaimedRobot:
         description,
         {name: value for name, value in numbers.items() if name in used},
         limit,
+        f"{robot.limits[0]}",
         {name: names[name] for name in uncertain},
         mixed,
         {named.symbol: polynomials[named.name] for named, _ in robot.derived},
