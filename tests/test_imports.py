@@ -42,7 +42,7 @@ STEPS = (
 
 # Packages that only some modules may import.
 OWNERS = {
-    "mujoco": {"plants.model", "plants.mjx", "plants.lagrange", "plants.draft", "analysis.animate"},
+    "mujoco": {"plants.model", "plants.mjx", "plants.lagrange", "plants.draft", "plants.drawing", "analysis.animate"},
     "cvxpy": {"certificate"},
     "clarabel": {"certificate"},
     "flint": {"certificate"},

@@ -90,6 +90,7 @@ VERBS = {
         "rtcd_jax.cli.run_verbs:animate",
         "show the swing-up of a run's initial and best candidate as MP4 and GIF",
         jax=True,
+        shown=True,
     ),
     "replay": Verb("rtcd_jax.cli.run_verbs:replay", "say whether a measured motion stayed inside a run's funnel"),
     "certify": Verb(

@@ -17,10 +17,11 @@ from jaxtyping import Float
 from mujoco.batch import Batch
 
 from rtcd_jax.config.robot import OPTION, Robot, value_of
+from rtcd_jax.plants.drawing import view_of
 from rtcd_jax.system.errors import UserError
 
 CAMERA = "front"
-"""What `animate` looks through: along y, with z up. A model without it is given one."""
+"""What `animate` looks through. A model without it is given one that sees its motion."""
 LEAST_INERTIA = 1e-12
 """What MuJoCo wants of a point mass [kg m^2]."""
 
@@ -94,8 +95,10 @@ def recompiled(robot: Robot, values: Mapping[str, float]) -> mujoco.MjModel:
         else:
             setattr(element, edit.field, np.maximum(numbers, LEAST_INERTIA) if edit.field == "inertia" else numbers)
     if not any(camera.name == CAMERA for camera in spec.cameras):
-        spec.worldbody.add_camera(name=CAMERA, pos=[0, -3, 0], quat=[np.sqrt(0.5), np.sqrt(0.5), 0, 0])
-        spec.worldbody.add_light(pos=[0, -2, 2], dir=[0, 1, -1])
+        view, quat = view_of(base), np.empty(4)
+        mujoco.mju_mat2Quat(quat, view.T.ravel())  # a camera's columns: right, up, back
+        spec.worldbody.add_camera(name=CAMERA, pos=3 * view[2], quat=quat)
+        spec.worldbody.add_light(pos=2 * (view[2] + view[1]), dir=-view[2] - view[1])
     try:
         return _as_simulated(spec.compile())
     except ValueError as error:

@@ -56,10 +56,11 @@ class Camera:
 
     def reach(self, positions: Float[np.ndarray, "poses q"]) -> float:
         """How far the robot gets from the origin in the picture's plane, to each side and up and down [m]."""
-        farthest = 0.0
+        farthest, camera = 0.0, self._model.camera(self._camera).id
         for pose in positions:
             self._pose(pose)
-            across = np.abs(self._data.geom_xpos[:, [0, 2]]).max(axis=1)
+            right_and_up = self._data.cam_xmat[camera].reshape(3, 3)[:, :2]
+            across = np.abs(self._data.geom_xpos @ right_and_up).max(axis=1)
             farthest = max(farthest, float((across + self._model.geom_rbound).max()))
         return farthest
 

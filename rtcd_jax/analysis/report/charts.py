@@ -77,7 +77,8 @@ class Chart:
     """A figure: panels, row by row, and the label of the horizontal axis that they share.
 
     `title` heads its section of the page, `note` says on what ground its numbers stand, `events` are instants to be
-    marked, `height` [in] is that of the print. Of several `columns` every panel is a small plot of its own on the page.
+    marked, `reading` says on the page what to make of it, `height` [in] is that of the print. Of several `columns`
+    every panel is a small plot of its own on the page.
     """
 
     title: str
@@ -85,6 +86,7 @@ class Chart:
     panels: Sequence[Panel]
     height: float
     note: str = ""
+    reading: str = ""
     columns: int = 1
     events: Sequence[float] = ()
     event: str = ""

@@ -17,6 +17,9 @@ from rtcd_jax.analysis.report.words import guarantee, listed, quantity, volume_u
 from rtcd_jax.config.load import Config
 from rtcd_jax.volume import VOLUMES
 
+TUBE_POINTS = 41
+"""Of an ellipse's outline in a funnel over time."""
+
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.cm import ScalarMappable
@@ -35,6 +38,31 @@ def draw_funnels(run: Run) -> list[Path]:
     with blank((WIDTH, 2.9 * len(planes(run.best.x.shape[1])) + 3.1)) as figure:
         _beside(figure, run)
         return written(figure, run.figures, "funnel")
+
+
+def draw_tubes(run: Run) -> list[Path]:
+    """Draws the funnels over time, one picture for every plane of a coordinate and its velocity; the files written.
+
+    Raises:
+        UserError: a folder that cannot be written.
+    """
+    config, funnels, pairs = run.config, run.funnels, planes(run.best.x.shape[1])
+    with blank((WIDTH, 3.8 * len(pairs))) as figure:
+        for place, pair in enumerate(pairs, 1):
+            axes = figure.add_subplot(len(pairs), 1, place, projection="3d")
+            plane = plane_of(config, funnels, pair, TUBE_POINTS)
+            for shadow in plane.shadows:
+                time = np.broadcast_to(shadow.funnel.elite.time[:, None], shadow.outlines.shape[:2])
+                look = {"color": shadow.funnel.color, "alpha": 0.25, "lw": 0, "rcount": 60, "ccount": TUBE_POINTS}
+                axes.plot_surface(time, *np.moveaxis(shadow.outlines, 2, 0), **look)
+                axes.plot(time[:, 0], *shadow.motion.T, color=shadow.funnel.color, label=shadow.funnel.label)
+            horizontal, vertical = itertools.starmap(quantity, plane.states)
+            axes.set(xlabel="time [s]", ylabel=horizontal, zlabel=vertical)
+            axes.view_init(elev=20, azim=-65)
+            axes.set_box_aspect((2, 1, 1))
+            axes.locator_params(nbins=5)
+        figure.legend(**shared_legend(figure.axes), loc="outside upper center")
+        return written(figure, run.figures, "tube")
 
 
 def levels(config: Config, funnels: Sequence[FunnelView], note: str = "") -> Chart:

@@ -1,6 +1,11 @@
 """Charts of the swing-up over time: states with the funnel's extent, inputs, V/rho of disturbed motions, gains."""
 
+import itertools
+import math
 from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import final
 
 import numpy as np
 from jaxtyping import Float
@@ -18,6 +23,10 @@ STARTS = 64
 """Disturbed motions of each controller, from the boundary of its first ellipsoid."""
 STEPS = 8
 """Runge-Kutta steps of a knots' interval."""
+FRAME = 0.04
+"""Longest time between two instants of a motion that is shown moving [s], if the steps allow it."""
+HOLD = 1.0
+"""Seconds at the goal."""
 
 
 def charts_of_motion(config: Config, funnels: Sequence[FunnelView]) -> dict[str, Chart]:
@@ -63,17 +72,60 @@ def gains(config: Config, funnels: Sequence[FunnelView]) -> Chart:
 
 def boundary_ratio(elite: Elite) -> Float[np.ndarray, " knots"]:
     """The largest V/rho at every knot of motions that start on the boundary of the first ellipsoid."""
+    motions = boundary_motions(elite)
+    ratio = np.max(motions.ratio[:: motions.stride], axis=1)[: len(elite.time)]
+    return np.where(np.isfinite(ratio), ratio, np.nan)
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Motions:
+    """`STARTS` motions from the boundary of the first ellipsoid, and the nominal one as the first.
+
+    The times [s] are the knots and `stride` - 1 instants between two of them, and go on for `HOLD` seconds at the goal.
+    `ratio` is V/rho at the knots; between them it repeats the last one.
+    """
+
+    time: Float[np.ndarray, " T"]
+    x: Float[np.ndarray, "T motions n"]
+    ratio: Float[np.ndarray, "T motions"]
+    stride: int
+
+    @property
+    def widest(self) -> int:
+        """The disturbed motion that comes closest to the funnel's boundary after its start, or leaves it farthest."""
+        after = np.nan_to_num(self.ratio[self.stride :], nan=np.inf)
+        return 1 + int(np.argmax(np.max(after, axis=0)[1:]))
+
+
+@lru_cache(maxsize=16)
+def boundary_motions(elite: Elite) -> Motions:
+    """The closed loop from the boundary of the first ellipsoid, to the goal and held there.
+
+    Raises:
+        UserError: an unknown plant, or the elite's parameters lack one.
+    """
     f = dynamics_of(elite)
-    loop, march = ClosedLoop.of(elite, f), runge_kutta(f, float(elite.time[1] - elite.time[0]) / STEPS)
+    interval = float(elite.time[1] - elite.time[0])
+    loop, march = ClosedLoop.of(elite, f), runge_kutta(f, interval / STEPS)
+    every = next(each for each in (8, 4, 2, 1) if each * interval / STEPS <= FRAME or each == 1)
     y = np.random.default_rng(0).normal(size=(STARTS, elite.x_goal.size))
     y /= np.linalg.norm(y, axis=1, keepdims=True)
-    x = elite.x[0] + y @ ellipsoid_axes(elite.S[0], elite.rho[0]).T
-    ratio = np.ones(len(elite.time))
+    x = np.concatenate([elite.x[:1], elite.x[0] + y @ ellipsoid_axes(elite.S[0], elite.rho[0]).T])
+    ratio = np.r_[0.0, np.ones(STARTS)]
+    times, states, ratios = [elite.time[:1]], [x], [ratio]
+    ends = [*elite.time, *(elite.time[-1] + interval * np.arange(1, math.ceil(HOLD / interval) + 1))]
     with np.errstate(all="ignore"):  # a motion far outside an external funnel may have no end; then there is a gap
-        for k, (start, end) in enumerate(zip(elite.time[:-1], elite.time[1:], strict=True)):
-            *_, x = march(loop.tracking(k), float(start), float(end), x)
-            ratio[k + 1] = np.max(elite.value(k + 1, x)) / elite.rho[k + 1]
-    return np.where(np.isfinite(ratio), ratio, np.nan)
+        for k, (start, end) in enumerate(itertools.pairwise(ends)):
+            policy = loop.tracking(k) if k < len(elite.u) else loop.holding()
+            passed = list(march(policy, float(start), float(end), x))[every - 1 :: every]
+            x = passed[-1]
+            knot = min(k + 1, len(elite.u))
+            before, ratio = ratio, elite.value(knot, x) / elite.rho[knot]
+            states += passed
+            ratios += [*[before] * (len(passed) - 1), ratio]
+            times.append(np.linspace(start, end, len(passed) + 1)[1:])
+    return Motions(np.concatenate(times), np.array(states), np.array(ratios), STEPS // every)
 
 
 def _state(funnel: FunnelView, i: int) -> tuple[Band, Curve]:

@@ -8,31 +8,40 @@ import base64
 import dataclasses
 import html
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from importlib import resources
 from pathlib import Path
+from typing import Any
 
 from rtcd_jax.analysis.report import tables
 from rtcd_jax.analysis.report.canvas import print_chart
-from rtcd_jax.analysis.report.charts import Chart, table
-from rtcd_jax.analysis.report.funnels import draw_funnels, draw_over, levels
-from rtcd_jax.analysis.report.motion import charts_of_motion
+from rtcd_jax.analysis.report.charts import Chart
+from rtcd_jax.analysis.report.charts import table as csv_of
+from rtcd_jax.analysis.report.elements import four_digits, note, place, section, table
+from rtcd_jax.analysis.report.funnels import draw_funnels, draw_over, draw_tubes, levels
+from rtcd_jax.analysis.report.motion import STARTS, charts_of_motion
 from rtcd_jax.analysis.report.plots import planes_of
 from rtcd_jax.analysis.report.progress import charts
-from rtcd_jax.analysis.report.reading import Experiment, Run, Tolerance, compared, funnel_views, read_run
-from rtcd_jax.analysis.report.tables import Cell, Table
-from rtcd_jax.analysis.report.traces import plots_of
-from rtcd_jax.analysis.report.words import NONE, duration, guarantee, ratio, volume_unit, words
+from rtcd_jax.analysis.report.reading import (
+    Experiment,
+    FunnelView,
+    Run,
+    Tolerance,
+    compared,
+    funnel_views,
+    read_run,
+)
+from rtcd_jax.analysis.report.robot import robots_of
+from rtcd_jax.analysis.report.traces import Plot, legend, plots_of
+from rtcd_jax.analysis.report.words import duration, guarantee, ratio, volume_unit, words
 from rtcd_jax.system.console import Console
 from rtcd_jax.system.errors import UserError
 from rtcd_jax.system.files import replace
 
-POLICY = "default-src 'none'; script-src 'unsafe-inline'; style-src 'unsafe-inline'; img-src data: blob:"
+POLICY = (
+    "default-src 'none'; script-src 'unsafe-inline'; style-src 'unsafe-inline'; img-src data: blob:; media-src data:"
+)
 """What the browser may do: run and show what is in the page."""
-
-LONGEST = 40
-"""Characters of a cell that is not wrapped."""
-_NUMBER, _LONG = ' class="number"', ' class="long"'
 
 
 def report(folders: Sequence[Path], to: Path | None = None, console: Console | None = None) -> list[Path]:
@@ -78,13 +87,13 @@ def draw_figures(run: Run) -> list[Path]:
 
     Raises UserError if they cannot be written.
     """
-    funnels = draw_over([run], run.figures, "overlay") + draw_funnels(run)
+    funnels = draw_over([run], run.figures, "overlay") + draw_funnels(run) + draw_tubes(run)
     note = guarantee(run.best.record)
     others = {"levels": levels(run.config, run.funnels, note), **charts_of_motion(run.config, run.funnels)}
     others |= charts([run])
     drawn = [path for name, chart in others.items() for path in print_chart(chart, run.figures, name)]
     for name, chart in others.items():
-        replace(run.figures / f"{name}.csv", table(chart).encode())
+        replace(run.figures / f"{name}.csv", csv_of(chart).encode())
     return funnels + drawn
 
 
@@ -93,20 +102,26 @@ def render(runs: Sequence[Run]) -> str:
     title = html.escape(" and ".join(run.name for run in runs))
     views = funnel_views(runs)
     of_motion, of_search = charts_of_motion(runs[0].config, views), charts(runs)
-    funnels = planes_of(runs[0].config, views) | plots_of("levels", levels(runs[0].config, views))
-    figures = dict(funnels)
+    planes, others = planes_of(runs[0].config, views)
+    figures = planes | others | plots_of("levels", levels(runs[0].config, views))
     for name, chart in {**of_motion, **of_search}.items():
         figures |= plots_of(name, chart)
-    data = json.dumps(figures, allow_nan=False, separators=(",", ":")).replace("<", "\\u003c")
-    body = "\n".join([_header(runs), *_sections(runs, list(funnels), of_motion, of_search)])
+    funnels = _funnels(runs, views, planes, others)
+    body = "\n".join([_header(runs), *_sections(runs, funnels, of_motion, of_search)])
     return (
         f'<!doctype html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n<title>{title}</title>\n'
         f'<meta name="viewport" content="width=device-width, initial-scale=1">\n'
         f'<meta http-equiv="Content-Security-Policy" content="{POLICY}">\n<link rel="icon" href="data:,">\n'
         f"<style>\n{_asset('page.css')}</style>\n<script>{_plotly()}</script>\n</head>\n<body>\n<main>\n{body}\n</main>\n"
-        f'<script type="application/json" id="figures">{data}</script>\n<script>\n{_asset("page.js")}</script>\n'
+        f"{_data('figures', figures)}\n{_data('robots', robots_of(views))}\n<script>\n{_asset('page.js')}</script>\n"
         "</body>\n</html>\n"
     )
+
+
+def _data(name: str, content: Any) -> str:
+    """What the page's script reads."""
+    text = json.dumps(content, allow_nan=False, separators=(",", ":")).replace("<", "\\u003c")
+    return f'<script type="application/json" id="{name}">{text}</script>'
 
 
 def _header(runs: Sequence[Run]) -> str:
@@ -124,7 +139,7 @@ def _header(runs: Sequence[Run]) -> str:
         candidate = f'<p class="candidate">best: {html.escape(tables.candidate(runs[0]))}</p>'
     else:
         cards = "".join(
-            _card(run.name, f"× {_four_digits(_gain(run, 'sum'))}", f"sum over its initial one, {run.best.guarantee}")
+            _card(run.name, f"× {four_digits(_gain(run, 'sum'))}", f"sum over its initial one, {run.best.guarantee}")
             for run in runs
         )
         candidate = ""
@@ -138,7 +153,7 @@ def _headlines(run: Run) -> Iterator[tuple[str, str, str]]:
     objective = run.config.search.objective
     for name in dict.fromkeys((objective, "sum", "inlet")):
         searched = ", searched" if name == objective else ""
-        yield f"{words(name)} over initial", f"× {_four_digits(_gain(run, name))}", run.best.guarantee + searched
+        yield f"{words(name)} over initial", f"× {four_digits(_gain(run, name))}", run.best.guarantee + searched
     yield "swing-up", duration(float(run.best.time[-1])), "of the best, start to goal"
     certificate = run.certificates.get("000")
     if certificate is None:
@@ -161,66 +176,115 @@ def _card(name: str, value: str, remark: str) -> str:
 
 
 def _sections(
-    runs: Sequence[Run], funnels: Sequence[str], of_motion: Mapping[str, Chart], of_search: Mapping[str, Chart]
+    runs: Sequence[Run], funnels: Iterable[str], of_motion: Mapping[str, Chart], of_search: Mapping[str, Chart]
 ) -> Iterator[str]:
     alone = runs[0] if len(runs) == 1 else None
     if alone is None:
-        yield _section("Compared", _table(tables.comparison(runs)))
-    yield _section("Funnels", *_funnels(runs, funnels))
+        yield section("Compared", table(tables.comparison(runs)))
+    yield section("Funnels", *funnels)
+    for run in runs:
+        if video := _video(run):
+            yield section("Swing-up" if alone else f"Swing-up: {run.name}", video)
     for name, chart in of_motion.items():
-        yield _section(chart.title, *_charted(name, chart))
-    promise = "" if alone is None else _note(f"The best funnel is {guarantee(alone.best.record)}.")
+        yield section(chart.title, *_charted(name, chart))
+    promise = "" if alone is None else note(f"The best funnel is {guarantee(alone.best.record)}.")
     advice = (
         "Ratios are optimal over initial. The sum counts knots, most of them near the goal: look at the initial "
         "ellipsoid too, that of the first knot, where disturbances come first; configurations call it the inlet."
     )
-    yield _section("Initial and optimal", _table(tables.gains(runs)), promise, _note(advice))
+    yield section("Initial and optimal", table(tables.gains(runs), folds=True), promise, note(advice))
     for name, chart in of_search.items():
-        table = tables.conflicts(runs[0]) if name == "conflicts" else None
-        yield _section(chart.title, *([_table(table)] if table else []), *_charted(name, chart))
+        conflicts = tables.conflicts(runs[0]) if name == "conflicts" else None
+        yield section(chart.title, *([table(conflicts)] if conflicts else []), *_charted(name, chart))
     if alone:
-        yield _section("Elites", _table(tables.elites(alone)), _note("Click a heading to sort."))
-    yield _section("Certificates", *_certified(runs))
+        yield section("Elites", table(tables.elites(alone)), note("Click a heading to sort."))
+    yield section("Certificates", *_certified(runs))
     verification = tables.verification(runs)
-    yield _section("Verification", _table(verification) if verification else _note("Nothing yet: rtcd verify RUN."))
+    yield section("Verification", table(verification) if verification else note("Nothing yet: rtcd verify RUN."))
     for run in runs:
         for experiment in run.experiments:
             name = words(experiment.name) if alone else f"{words(experiment.name)}: {run.name}"
-            yield _section(f"Disturbance: {name}", _table(tables.experiment(experiment)), *_pictures(experiment))
+            yield section(f"Disturbance: {name}", table(tables.experiment(experiment)), *_pictures(experiment))
         for tolerated in run.tolerances:
             name = f"Tolerance: elite {tolerated.elite}" + ("" if alone else f" of {run.name}")
-            yield _section(name, _table(tables.tolerance(run, tolerated)), *_pictures(tolerated))
-    yield _section("Provenance", _table(tables.provenance(runs)))
+            yield section(name, table(tables.tolerance(run, tolerated)), *_pictures(tolerated))
+    yield section("Provenance", table(tables.provenance(runs)))
 
 
 def _charted(name: str, chart: Chart) -> Iterator[str]:
     """The places of a chart's plots, and its note."""
     if chart.columns == 1:
-        yield _plot(name, ("", "tall", "taller")[min(len(chart.panels) // 3, 2)])
+        yield place(name, ("", "tall", "taller")[min(len(chart.panels) // 3, 2)])
     else:
-        yield f'<div class="grid">{"".join(_plot(each, "small") for each in plots_of(name, chart))}</div>'
-    if chart.note:
-        yield _note(f"{chart.note[0].upper()}{chart.note[1:]}.")
+        labels = {label: color for panel in chart.panels for label, color in legend(panel).items()}
+        keys = (
+            f'<span><i style="background:{color}"></i>{html.escape(label)}</span>' for label, color in labels.items()
+        )
+        yield f'<p class="legend">{"".join(keys)}</p>'
+        yield f'<div class="grid">{"".join(place(each, "small") for each in plots_of(name, chart))}</div>'
+    for text in filter(None, (chart.note, chart.reading)):
+        yield note(f"{text[0].upper()}{text[1:]}.")
 
 
-def _funnels(runs: Sequence[Run], names: Sequence[str]) -> Iterator[str]:
+def _funnels(
+    runs: Sequence[Run], views: Sequence[FunnelView], planes: Mapping[str, Plot], others: Mapping[str, Plot]
+) -> Iterator[str]:
     for run in runs:
         if run.absence:
-            yield _note(f"{run.name}: {run.absence}" if len(runs) > 1 else f"{run.absence}.")
+            yield note(f"{run.name}: {run.absence}" if len(runs) > 1 else f"{run.absence}.")
     yield (
-        '<label class="moment">ellipsoid at <output>0.00 s</output>'
-        '<input type="range" min="0" max="1" step="0.002" value="0" aria-label="time along the motion"></label>'
+        '<div class="moment"><button type="button" class="play" aria-label="play">▶</button>'
+        "<label>motion and ellipsoid at <output>0.00 s</output>"
+        '<input type="range" min="0" max="1" step="0.002" value="0" aria-label="time along the motion"></label></div>'
     )
-    *planes, levels = names
-    yield f'<div class="grid wide">{"".join(map(_plot, planes))}</div>'
-    yield _note(
+    yield f'<div class="robots">{"".join(_robot(i, view) for i, view in enumerate(views))}</div>'
+    yield note(
+        f"Pale: of {STARTS} motions from the boundary of the first ellipsoid the one that uses most of the funnel, in "
+        "the planes a dotted line. Drag a robot to turn it."
+    )
+    yield f'<div class="grid wide">{"".join(map(place, planes))}</div>'
+    yield note(
         "Shadows of every knot's ellipsoid on the plane of a coordinate and its velocity. A click in the legend hides."
     )
-    yield _plot(levels, "tall")
+    chosen = next(iter(others or planes))
+    if others:
+        options = "".join(
+            f'<option value="{name}"{" selected" * (name == chosen)}>{html.escape(_axes(plot))}</option>'
+            for name, plot in {**planes, **others}.items()
+        )
+        yield f'<label class="pair">plane of <select aria-label="plane of two states">{options}</select></label>'
+    flat = f'<div class="plot" data-figure="{chosen}" data-chosen></div>' if others else ""
+    yield f'<div class="grid wide">{flat}<div class="plot tube" data-tube="{chosen}"></div></div>'
+    yield place("levels", "tall")
     for run in runs:
         if push := run.best.record.get("push"):
             whose = f"{run.name}: " if len(runs) > 1 else ""
-            yield _note(whose + _push_margin(run, push))
+            yield note(whose + _push_margin(run, push))
+
+
+def _axes(plot: Plot) -> str:
+    """`θ [rad], dθ/dt [rad/s]`."""
+    return ", ".join(plot["layout"][axis]["title"]["text"] for axis in ("xaxis", "yaxis"))
+
+
+def _robot(number: int, view: FunnelView) -> str:
+    """The place of a robot, its name and what is said of the disturbed motion at the slider's time."""
+    name = html.escape(view.label)
+    return (
+        f'<figure class="robot" data-robot="{number}"><svg role="img" aria-label="robot, {name}"></svg>'
+        f'<figcaption><i style="background:{view.color}"></i>{name}<output></output></figcaption></figure>'
+    )
+
+
+def _video(run: Run) -> str | None:
+    """What `rtcd animate` left in the run's folder: the video, else the moving picture."""
+    folder, label = run.path / "animation", f'aria-label="swing-up of {html.escape(run.name)}"'
+    video, picture = folder / "swingup.mp4", folder / "swingup.gif"
+    if video.is_file():
+        return f'<video controls loop muted playsinline {label} src="data:video/mp4;base64,{_base64(video)}"></video>'
+    if picture.is_file():
+        return f'<img src="data:image/gif;base64,{_base64(picture)}" alt="swing-up of {html.escape(run.name)}">'
+    return None
 
 
 def _push_margin(run: Run, push: Mapping[str, float | None]) -> str:
@@ -238,54 +302,25 @@ def _push_margin(run: Run, push: Mapping[str, float | None]) -> str:
 def _certified(runs: Sequence[Run]) -> Iterator[str]:
     certificates = tables.certificates(runs)
     if certificates is None:
-        yield _note("Nothing yet: rtcd certify RUN.")
+        yield note("Nothing yet: rtcd certify RUN.")
         return
-    yield _table(certificates)
+    yield table(certificates)
     for run in runs:
         ranks = tables.ranks(run)
         if ranks:
             whose = f"{run.name}: " if len(runs) > 1 else ""
             correlation = f"rank correlation of sampled and shown sums over {ranks[1]} elites: {ranks[0]:.3f}"
-            yield _note(whose + correlation)
+            yield note(whose + correlation)
 
 
 def _pictures(experiment: Experiment | Tolerance) -> Iterator[str]:
     for path in (each for each in experiment.pictures if each.is_file()):
-        data = base64.b64encode(path.read_bytes()).decode()
-        picture = f'<img src="data:image/png;base64,{data}" alt="{html.escape(words(path.stem))}">'
+        picture = f'<img src="data:image/png;base64,{_base64(path)}" alt="{html.escape(words(path.stem))}">'
         yield f'<div class="scroll">{picture}</div>'
 
 
-def _section(title: str, *parts: str) -> str:
-    return f"<section><h2>{html.escape(title)}</h2>\n{''.join(parts)}\n</section>"
-
-
-def _plot(name: str, size: str = "") -> str:
-    return f'<div class="plot {size}" data-figure="{name}"></div>'
-
-
-def _note(text: str) -> str:
-    return f'<p class="note">{html.escape(text)}</p>'
-
-
-def _table(table: Table) -> str:
-    heads = "".join(
-        f'<th scope="col"{_NUMBER * numeric}><button type="button">{html.escape(head)}</button></th>'
-        for head, numeric in zip(table.heads, table.numeric, strict=True)
-    )
-    rows = "\n".join(f"<tr>{''.join(map(_cell, row, table.numeric))}</tr>" for row in table.rows)
-    return f'<div class="scroll"><table>\n<thead><tr>{heads}</tr></thead>\n<tbody>\n{rows}\n</tbody></table></div>'
-
-
-def _cell(value: Cell, numeric: bool) -> str:
-    if isinstance(value, str):
-        return f"<td{_LONG * (len(value) > LONGEST)}>{html.escape(value)}</td>"
-    sorted_by = " data-none" if value is None else f' data-value="{value!r}"'
-    return f"<td{_NUMBER * numeric}{sorted_by}>{_four_digits(value)}</td>"
-
-
-def _four_digits(value: float | int | None) -> str:
-    return NONE if value is None else f"{value}" if isinstance(value, int) else f"{value:.4g}"
+def _base64(path: Path) -> str:
+    return base64.b64encode(path.read_bytes()).decode()
 
 
 def _asset(name: str) -> str:

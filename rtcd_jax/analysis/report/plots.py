@@ -7,23 +7,30 @@ import numpy as np
 from rtcd_jax.analysis.report.canvas import BLACK, GRAY
 from rtcd_jax.analysis.report.plane import Plane, Shadow, plane_of
 from rtcd_jax.analysis.report.reading import FunnelView
-from rtcd_jax.analysis.report.shapes import planes
+from rtcd_jax.analysis.report.shapes import other_planes, planes
 from rtcd_jax.analysis.report.traces import Plot, faint, numbers
 from rtcd_jax.analysis.report.words import letter, volume_unit
 from rtcd_jax.config.load import Config
 
-POINTS = 49
-"""Of an ellipse's outline: a page of 200 knots stays below two megabytes."""
+POINTS, COARSE = 49, 33
+"""Of an ellipse's outline, in the plane of a coordinate and its velocity and in another one: a page of 200 knots stays
+small."""
 
 
-def planes_of(config: Config, funnels: Sequence[FunnelView]) -> dict[str, Plot]:
-    """The funnels in every plane of a coordinate and its velocity, by the plots' names on the page."""
-    unit, pairs = volume_unit(config), planes(len(config.plant.states))
-    return {f"plane{i}": plane_plot(plane_of(config, funnels, pair, POINTS), unit) for i, pair in enumerate(pairs)}
+def planes_of(config: Config, funnels: Sequence[FunnelView]) -> tuple[dict[str, Plot], dict[str, Plot]]:
+    """The funnels by the plots' names: in every plane of a coordinate and its velocity, and in all other planes."""
+    unit, n = volume_unit(config), len(config.plant.states)
+
+    def plots(pairs: Sequence[tuple[int, int]], points: int, first: int) -> dict[str, Plot]:
+        drawn = ((pair, plane_of(config, funnels, pair, points)) for pair in pairs)
+        return {f"plane{i}": plane_plot(plane, unit, pair, points) for i, (pair, plane) in enumerate(drawn, first)}
+
+    usual = planes(n)
+    return plots(usual, POINTS, 0), plots(other_planes(n), COARSE, len(usual))
 
 
-def plane_plot(plane: Plane, unit: str) -> Plot:
-    """Funnels over one another; `moments` says which traces the time slider fills from which."""
+def plane_plot(plane: Plane, unit: str, pair: tuple[int, int], points: int) -> Plot:
+    """Funnels over one another; `moments` says which traces the time slider fills from which, `pair` which states."""
     bodies = [_body(shadow) for shadow in plane.shadows]
     motions = [_motion(shadow, unit) for shadow in plane.shadows]
     moments = [_outline(shadow.funnel) for shadow in plane.shadows]
@@ -37,9 +44,10 @@ def plane_plot(plane: Plane, unit: str) -> Plot:
             "shapes": [_limit(axis, value) for axis, value in plane.visible_limits],
         },
         "moments": [
-            {"source": i, "trace": 2 * count + i, "times": numbers(shadow.funnel.elite.time), "points": POINTS + 1}
+            {"source": i, "trace": 2 * count + i, "times": numbers(shadow.funnel.elite.time), "points": points + 1}
             for i, shadow in enumerate(plane.shadows)
         ],
+        "pair": pair,
     }
 
 

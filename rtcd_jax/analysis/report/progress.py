@@ -20,6 +20,12 @@ STATUS_COLORS = {
     "NOT_FINITE": "#000000",
 }
 SPREAD = f"{QUANTILES[0]} to {QUANTILES[1]} % of the population"
+SIGMA = (
+    "the step size σ is the population's standard deviation along its widest axis. It rises while a generation's step "
+    "goes on in the last one's direction: on the way to a distant optimum, and in a corner of the box, where a "
+    "candidate beyond it counts as one on it. It falls once the steps turn about an optimum"
+)
+"""Why a step size rises at first."""
 SEARCHES: Mapping[str, tuple[Style, float]] = {"best_so_far": ("solid", 1.8), "median": ("dotted", 1.0)}
 """What is compared of searches, and how its lines look."""
 
@@ -51,11 +57,12 @@ def convergence(run: Run) -> Chart:
     title = f"{run.config.plant.name}, {search.mode} search, population {search.population}, seed {search.seed}"
     logarithmic = more_than_a_decade(best_so_far, best, median)
     statuses = {
-        status_words(name): (share, STATUS_COLORS.get(name, GRAY)) for name, share in failures(generations).items()
+        status_words(name): (100 * share, STATUS_COLORS.get(name, GRAY))
+        for name, share in failures(generations).items()
     }
     panels = [
         Panel(label, marks, title, logarithmic, height=3),
-        Panel("candidates\nby status [-]", [Shares(index, statuses)], window=(0, 1), height=1.2),
+        Panel("candidates\nby status [%]", [Shares(index, statuses)], window=(0, 100), height=1.2),
         Panel(
             "step size σ\n[box widths]",
             [Curve(index, sigma, "", BLACK, style="marked")],
@@ -64,7 +71,7 @@ def convergence(run: Run) -> Chart:
     ]
     restarts = index[np.diff(column(generations, "restarts"), prepend=0) > 0].tolist()
     note = "sampled, as the search saw it"
-    return Chart("Search", "generation", panels, 5.8, note, events=restarts, event="restart")
+    return Chart("Search", "generation", panels, 5.8, note, SIGMA, events=restarts, event="restart")
 
 
 def variables(run: Run) -> Chart:
@@ -109,13 +116,13 @@ def compared_convergence(runs: Sequence[Run]) -> Chart:
             label = f"{run.name} ({words(run.config.search.objective)})" if first else f"{run.name}, {words(name)}"
             values = column(run.generations, name)
             volumes.append(Curve(evaluated, values, label, run.color, style, width, run.name))
-        label, share = f"{run.name}, feasible", column(run.generations, "feasible")
+        label, share = f"{run.name}, feasible", 100 * column(run.generations, "feasible")
         feasible.append(Curve(evaluated, share, label, run.color, width=1.0, group=run.name))
     units = ", ".join(sorted({volume_unit(run.config, run.config.search.objective) for run in runs}))
     logarithmic = more_than_a_decade(*(curve.y for curve in volumes))
     panels = [
         Panel(f"volume [{units}]", volumes, logarithmic=logarithmic, height=3),
-        Panel("with a funnel [-]", feasible, window=(0, 1.03)),
+        Panel("with a funnel [%]", feasible, window=(0, 103)),
     ]
     note = "sampled, each search's own objective: solid the best so far, dotted each generation's median"
     return Chart("Search", "candidates", panels, 4.6, note)

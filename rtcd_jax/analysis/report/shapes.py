@@ -1,5 +1,7 @@
 """Ellipsoids {x : (x - x_k)' S_k (x - x_k) <= rho_k} as they are drawn: their shadows on planes of the state."""
 
+import itertools
+
 import numpy as np
 from jaxtyping import Float
 
@@ -9,6 +11,12 @@ def planes(n: int) -> list[tuple[int, int]]:
     if n % 2:
         raise ValueError(f"states must be coordinates and their velocities, got an odd number of them: {n}")
     return [(i, i + n // 2) for i in range(n // 2)]
+
+
+def other_planes(n: int) -> list[tuple[int, int]]:
+    """All further pairs of states."""
+    usual = planes(n)
+    return [pair for pair in itertools.combinations(range(n), 2) if pair not in usual]
 
 
 def projections(

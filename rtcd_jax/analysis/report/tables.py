@@ -152,13 +152,27 @@ def _verdict(not_refuted: Iterable[Any]) -> str:
     return "not refuted" if all(not_refuted) else "REFUTED"
 
 
+ALL_SHARES, SHARES = ("off_nominal", "robustness"), ("recovered", "success")
+"""Experiments of which every number of the summary is a share, and the names of shares in the others."""
+
+
 def experiment(record: Experiment) -> Table:
-    """An experiment's summary: a row for each of its mappings, or else one for each of its numbers."""
+    """An experiment's summary: a row for each of its mappings, or else one for each of its numbers.
+
+    Shares are in %; of the robustness score what fails first, the best candidate's least share, comes first.
+    """
     summary = record.summary
     if summary and all(isinstance(value, Mapping) for value in summary.values()):
-        heads = tuple(dict.fromkeys(key for value in summary.values() for key in value))
-        rows = tuple((words(name), *(_cell(value.get(key)) for key in heads)) for name, value in summary.items())
-        return Table(("", *map(words, heads)), rows)
+        heads = list(dict.fromkeys(key for value in summary.values() for key in value))
+        shares = {key for key in heads if record.name in ALL_SHARES or key in SHARES}
+        if record.name == "robustness":
+            last = list(summary.values())[-1]
+            heads.sort(key=lambda key: (key != "score", value if _is_number(value := last.get(key)) else 1.0))
+        rows = tuple(
+            (words(name), *(_percents(value.get(key), key in shares) for key in heads))
+            for name, value in summary.items()
+        )
+        return Table(("", *(f"{words(key)} [%]" if key in shares else words(key) for key in heads)), rows)
     return Table(("", ""), tuple((words(name), _cell(value)) for name, value in summary.items()))
 
 
@@ -257,6 +271,14 @@ def _searched_options(runs: Sequence[Run]) -> list[str]:
 
 def _weight_heads(run: Run) -> list[str]:
     return [f"{letter}{i + 1}" for letter, variables in run.config.weights for i in range(len(variables))]
+
+
+def _percents(value: Any, share: bool) -> Cell:
+    return 100 * value if share and _is_number(value) else _cell(value)
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool)
 
 
 def _run_head(runs: Sequence[Run]) -> tuple[str, ...]:

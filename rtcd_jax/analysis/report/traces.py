@@ -34,12 +34,18 @@ def plot(chart: Chart) -> Plot:
     layout: Plot = {"showlegend": chart.columns == 1}
     groups, room = set[str](), 1 - GAP * (len(chart.panels) - 1)
     total, top = sum(panel.height for panel in chart.panels), 1.0
+    named = [_groups(panel) for panel in chart.panels]
+    shared = all(each <= named[0] for each in named)
     for number, panel in enumerate(chart.panels, 1):
         suffix, bottom = "" if number == 1 else str(number), top - room * panel.height / total
+        own = {} if shared else {"legend": f"legend{suffix}"}
+        if not shared:
+            groups = set()
+            layout[f"legend{suffix}"] = {"y": round(top, 4)}
         for trace in (trace for mark in panel.marks for trace in _traces(mark, panel)):
             shown = trace.pop("shown", True) and trace["legendgroup"] not in groups
             groups |= {trace["legendgroup"]} if shown else set()
-            data.append(trace | {"yaxis": f"y{suffix}", "showlegend": shown})
+            data.append(trace | own | {"yaxis": f"y{suffix}", "showlegend": shown})
         domain = [round(max(bottom, 0.0), 4), round(top, 4)]
         layout[f"yaxis{suffix}"] = {
             "title": {"text": panel.label.replace("\n", "<br>")},
@@ -53,6 +59,23 @@ def plot(chart: Chart) -> Plot:
     line = {"type": "line", "yref": "paper", "y0": 0, "y1": 1, "line": {"color": GRAY, "dash": "dot", "width": 1}}
     layout["shapes"] = [line | {"x0": at, "x1": at} for at in numbers(np.asarray(chart.events))]
     return {"data": data, "layout": layout}
+
+
+def legend(panel: Panel) -> dict[str, str]:
+    """The labels of a panel with their colors."""
+    labels: dict[str, str] = {}
+    for mark in panel.marks:
+        if isinstance(mark, Shares):
+            labels |= {label: color for label, (_, color) in mark.parts.items()}
+        elif mark.label:
+            labels.setdefault(mark.label, mark.color)
+    return labels
+
+
+def _groups(panel: Panel) -> set[str]:
+    """What a panel's legend has an entry for."""
+    lines = {mark.group or mark.label for mark in panel.marks if not isinstance(mark, Shares) and mark.label}
+    return lines.union(*(mark.parts for mark in panel.marks if isinstance(mark, Shares)))
 
 
 def _scale(panel: Panel) -> Plot:

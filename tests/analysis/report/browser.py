@@ -123,10 +123,11 @@ class Tab:
         return [url for url in urls[1:] if not url.startswith(("data:", "blob:"))]
 
     def complaints(self):
-        """Errors and warnings of the page's scripts and of the browser about it."""
+        """Errors and warnings of the page's scripts and of the browser about it, without its hints on drawing speed."""
         thrown = [event["exceptionDetails"] for event in self._events("Runtime.exceptionThrown")]
         said = [event for event in self._events("Runtime.consoleAPICalled") if event["type"] in ("error", "warning")]
         logged = [event["entry"] for event in self._events("Log.entryAdded")]
+        logged = [entry for entry in logged if (entry["source"], entry["level"]) != ("rendering", "warning")]
         return [*thrown, *said, *logged]
 
     def screenshot(self, path, whole=False):

@@ -3,11 +3,12 @@
 import json
 import re
 
+import numpy as np
 import pytest
 
-from rtcd_jax.analysis.report import refresh, report
+from rtcd_jax.analysis.report import refresh, report, tables
 from rtcd_jax.analysis.report.page import render
-from rtcd_jax.analysis.report.progress import charts
+from rtcd_jax.analysis.report.progress import SIGMA, charts
 from rtcd_jax.analysis.report.reading import compared, read_run
 from rtcd_jax.analysis.report.traces import plot
 from rtcd_jax.system.errors import UserError
@@ -55,6 +56,8 @@ def chromium(tmp_path_factory):
 FIGURES = {"pendulum": 3 + 3 + 5, "cartpole": 4 + 5 + 5, "both": 3 + 3}
 """A plane for each coordinate, levels and convergence; the motion and each gain; where a run stands alone, a course for
 each free variable."""
+CHOSEN = {"pendulum": 0, "cartpole": 4, "both": 0}
+"""Other planes, of which the page shows one at a time."""
 
 
 @pytest.mark.parametrize("name", FIGURES)
@@ -63,8 +66,10 @@ def test_a_browser_shows_every_figure_without_error_or_request_or_sideways_scrol
     tab = chromium.open(pages[name], size, touch=size == browser.PHONE)
     assert tab.complaints() == []
     assert tab.requests() == []
-    drawn = tab.value("[...document.querySelectorAll('.plot')].map((box) => box.querySelectorAll('.main-svg').length)")
-    assert len(drawn) == FIGURES[name]
+    drawn = tab.value(
+        "[...document.querySelectorAll('.plot[data-figure]')].map((box) => box.querySelectorAll('.main-svg').length)"
+    )
+    assert len(drawn) == FIGURES[name] + bool(CHOSEN[name])
     assert all(drawn)
     assert tab.value("document.querySelectorAll('.scatterlayer .trace path').length") > 20
     width = "[document.documentElement.scrollWidth, document.documentElement.clientWidth]"
@@ -115,7 +120,95 @@ def test_the_slider_draws_each_funnel_s_ellipse_of_its_time(pages, chromium):
     })()"""
     for shown, last in tab.value(moved):
         assert shown == last
-    assert tab.value("document.querySelector('.moment output').textContent") == "1.80 s"
+    assert (
+        tab.value("document.querySelector('.moment output').textContent") == "3.00 s"
+    )  # the goal is held for 1 s and an interval's rest
+
+
+ROBOTS = """((time) => {
+  show(time);
+  const paths = (group) => [...group.querySelectorAll("path")].map((path) => path.getAttribute("d"));
+  return svgs.map(([, svg]) => [...svg.querySelectorAll("g")].map(paths));
+})(%s)"""
+
+
+def test_the_robots_stand_where_the_motions_are(pages, chromium):
+    """The bob, the ball that is farthest from the axis, is at l (sin theta, -cos theta) with that time's theta."""
+    tab = chromium.open(pages["pendulum"], browser.LAPTOP)
+    robot = tab.value("scene.robots")[1]
+    bob = next(part for part in robot["parts"] if part["body"] and len(part["points"]) == 1)
+    length = np.linalg.norm(bob["points"][0])
+    for k in (0, 3, 9):
+        groups = tab.value(ROBOTS % robot["times"][k])[1]
+        for name, paths in zip(("disturbed", "nominal"), groups, strict=True):
+            points = [[float(number) for number in re.findall(r"-?[0-9.]+", path)] for path in paths]
+            x, down = max((each for each in points if len(each) == 2), key=np.linalg.norm)
+            theta = robot[name]["x"][k][0]
+            assert (x, down) == pytest.approx((length * np.sin(theta), length * np.cos(theta)), abs=2e-3)
+
+
+def test_a_robot_is_turned_by_dragging_and_the_page_plays(pages, chromium):
+    tab = chromium.open(pages["pendulum"], browser.LAPTOP)
+    before = tab.value("svgs[0][1].innerHTML")
+    drag = """(() => {
+      const [, svg] = svgs[0];
+      svg.setPointerCapture = () => {};
+      for (const [kind, x] of [["down", 0], ["move", 90], ["up", 90]])
+        svg.dispatchEvent(new PointerEvent(`pointer${kind}`, { clientX: x, clientY: 0, pointerId: 1 }));
+      return svg.innerHTML;
+    })()"""
+    assert tab.value(drag) != before
+    assert tab.value("Math.abs(view.flat().reduce((sum, value) => sum + value * value, 0) - 3)") < 1e-3  # still a turn
+    tab.value("document.querySelector('.play').click()")
+    assert tab.value("document.querySelector('.play').getAttribute('aria-label')") == "pause"
+    tab.value("new Promise((done) => { const wait = () => now > 0.2 ? done() : setTimeout(wait, 50); wait(); })")
+    tab.value("document.querySelector('.play').click()")
+    assert tab.value("Math.abs(slider.value * latest - now)") < 0.02
+    assert tab.complaints() == []
+
+
+def test_any_two_states_can_be_chosen(pages, chromium):
+    tab = chromium.open(pages["cartpole"], browser.LAPTOP)
+    assert tab.value("[...document.querySelectorAll('.pair option')].length") == 6
+    chosen = """(() => {
+      const select = document.querySelector(".pair select");
+      select.value = "plane5";
+      select.dispatchEvent(new Event("change"));
+      const box = document.querySelector("[data-chosen]");
+      return [box.layout.xaxis.title.text, box.layout.yaxis.title.text, tube.dataset.tube, figures.plane5.pair];
+    })()"""
+    assert tab.value(chosen) == ["cart_dot [m/s]", "dθ/dt [rad/s]", "plane5", [2, 3]]
+    assert tab.complaints() == []
+
+
+def test_a_funnel_over_time_is_the_outlines_one_behind_the_other(pages, chromium):
+    tab = chromium.open(pages["pendulum"], browser.LAPTOP)
+    tab.value("tube.scrollIntoView()")
+    tab.value("new Promise((done) => { const wait = () => tubeDrawn ? done() : setTimeout(wait, 50); wait(); })")
+    assert tab.value("webgl")
+    surface, source = tab.value("[tube.data[0], figures.plane0.data[0]]")
+    knots = len(surface["y"])
+    rows = np.array([np.nan if each is None else each for each in source["x"]], float).reshape(knots, -1)[:, :-1]
+    np.testing.assert_array_equal(np.array(surface["y"]), rows)
+    assert [row[0] for row in surface["x"]] == tab.value("figures.plane0.moments[0].times")
+
+
+NARROW = """(() => {
+  const title = (section) => section.querySelector("h2").textContent;
+  const section = (name) => [...document.querySelectorAll("section")].find((each) => title(each) === name);
+  const cells = [...section("Initial and optimal").querySelectorAll("tbody tr:first-child td")];
+  const inside = ({ left, right }) => left >= 0 && right <= innerWidth;
+  return [
+    cells.map((cell) => inside(cell.getBoundingClientRect())),
+    cells.map((cell) => getComputedStyle(cell, "::before").content),
+  ];
+})()"""
+
+
+def test_a_phone_shows_every_column_of_initial_and_optimal(pages, chromium):
+    inside, heads = chromium.open(pages["pendulum"], browser.PHONE, touch=True).value(NARROW)
+    assert all(inside)
+    assert heads[:6] == [f'"{head}"' for head in ("volume", "unit", "initial", "optimal", "ratio", "time")]
 
 
 OVERLAPS = """(() => {
@@ -178,6 +271,34 @@ def test_pictures_of_an_experiment_are_in_the_page(tmp_path, pages):
     assert "<img" not in pages["pendulum"].read_text()
 
 
+def test_the_video_of_a_run_is_in_the_page_else_its_moving_picture(tmp_path):
+    run = finished(tmp_path / "run")
+    assert "Swing-up" not in render([read_run(run)])
+    (run / "animation").mkdir()
+    (run / "animation" / "swingup.gif").write_bytes(b"picture")
+    text = render([read_run(run)])
+    assert "<h2>Swing-up</h2>" in text
+    assert '<img src="data:image/gif;base64,cGljdHVyZQ=="' in text
+    (run / "animation" / "swingup.mp4").write_bytes(b"picture")
+    text = render([read_run(run)])
+    assert 'src="data:video/mp4;base64,cGljdHVyZQ=="' in text
+    assert "data:image/gif" not in text
+    assert "media-src data:" in text
+
+
+def test_shares_are_told_in_percent_and_what_fails_first_comes_first(tmp_path):
+    run = finished(tmp_path / "run")
+    (run / "disturbance").mkdir()
+    scores = {name: {"score": 0.8, "mass": 1.0, "delay": share} for name, share in (("initial", 1.0), ("best", 0.6))}
+    (run / "disturbance" / "robustness.json").write_text(json.dumps({"summary": scores}))
+    (table,) = [tables.experiment(each) for each in read_run(run).experiments]
+    assert table.heads == ("", "score [%]", "delay [%]", "mass [%]")
+    assert table.rows == (("initial", 80.0, 100.0, 100.0), ("best", 80.0, 60.0, 100.0))
+    charted = charts([read_run(run)])["convergence"]
+    assert charted.panels[1].label == "candidates\nby status [%]"
+    assert charted.reading in SIGMA
+
+
 def test_what_a_funnel_tolerates_is_in_the_page(tmp_path):
     run = finished(tmp_path / "run")
     mass = {"name": "mass", "unit": "-", "half_width": 0.02, "factor": 1.75, "borne": 0.035, "volumes": {"sum": 7.5}}
@@ -213,7 +334,7 @@ def test_compared_searches_show_best_median_and_feasible_share_over_their_candid
         ("rtc (sum)", "y", True), ("rtc, median", "y", False), ("rtc, feasible", "y2", False),
     ]  # fmt: skip
     second = [line for line in data if line["legendgroup"] == "rtcd"]
-    assert [line["y"] for line in second] == [[100.0, 101.0, 102.0], [60.0] * 3, [0.75] * 3]
+    assert [line["y"] for line in second] == [[100.0, 101.0, 102.0], [60.0] * 3, [75.0] * 3]
     assert all(line["x"] == [4, 8, 12] for line in data)
     assert {line["line"]["color"] for line in second} == {runs[1].color}
 
@@ -224,7 +345,7 @@ def test_plotly_knows_every_property_of_every_plot(pages):
     for name, count in FIGURES.items():
         (data,) = re.findall(r'id="figures">(.*?)</script>', pages[name].read_text(), flags=re.DOTALL)
         drawn = json.loads(data)
-        assert len(drawn) == count
+        assert len(drawn) == count + CHOSEN[name]
         for each in drawn.values():
             assert len(Figure(each["data"], each["layout"]).data) == len(each["data"])
 
@@ -235,7 +356,7 @@ def test_one_run_gets_its_page_and_figures_several_get_one_beside_them(tmp_path,
     assert page == first / "report.html"
     assert {path.relative_to(first) for path in drawn} == {
         first.relative_to(first) / "figures" / f"{name}.{kind}"
-        for name in ("overlay", "funnel", "levels", "motion", "gains", "courses", "convergence")
+        for name in ("overlay", "funnel", "tube", "levels", "motion", "gains", "courses", "convergence")
         for kind in ("png", "pdf")
     }
     before = sorted(first.rglob("*"))

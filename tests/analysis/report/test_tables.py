@@ -112,8 +112,8 @@ def test_verification_tells_what_each_simulator_saw(tmp_path):
 @pytest.mark.parametrize(
     ("summary", "heads", "told"),
     [
-        ({"initial": {"success": 0.2}, "best": {"success": 0.9, "lost": 3}}, ("", "success", "lost"),
-         (("initial", 0.2, None), ("best", 0.9, 3))),
+        ({"initial": {"success": 0.2}, "best": {"success": 0.9, "lost": 3}}, ("", "success [%]", "lost"),
+         (("initial", 20.0, None), ("best", 90.0, 3))),
         ({"starts": 1000, "held": True, "sizes": [1, 2]}, ("", ""),
          (("starts", 1000), ("held", "yes"), ("sizes", "[1, 2]"))),
         ({}, ("", ""), ()),
