@@ -42,7 +42,15 @@ STEPS = (
 
 # Packages that only some modules may import.
 OWNERS = {
-    "mujoco": {"plants.model", "plants.mjx", "plants.lagrange", "plants.draft", "plants.drawing", "analysis.animate"},
+    "mujoco": {
+        "plants.model",
+        "plants.mjx",
+        "plants.lagrange",
+        "plants.draft",
+        "plants.drawing",
+        "analysis.animate",
+        "export.templates",
+    },
     "cvxpy": {"certificate"},
     "clarabel": {"certificate"},
     "flint": {"certificate"},

@@ -8,13 +8,14 @@ from typing import Any, NamedTuple, final
 
 import jax
 import numpy as np
-from jaxtyping import Int
+from jaxtyping import Bool, Int
 
 from rtcd_jax.certificate.standing import Standing, certificate_path, standing
 from rtcd_jax.elite.elite import Elite, ellipsoid_axes
 from rtcd_jax.elite.funnel import FunnelInterpolant
 from rtcd_jax.export.proof import ProvedFunnel
 from rtcd_jax.export.rate import ControlRate, control_rate
+from rtcd_jax.export.robustness import borne
 from rtcd_jax.plants import model_of, plant_of
 from rtcd_jax.plants.base import Plant
 from rtcd_jax.system.errors import UserError
@@ -51,6 +52,8 @@ class Bundle:
     standing: Standing
     proof: ProvedFunnel | None
     control_rate: ControlRate
+    robustness: str = ""
+    """What `rtcd disturb` found that it bears, as a list in Markdown; empty where it was not tried."""
 
     @property
     def elite(self) -> Elite:
@@ -65,6 +68,11 @@ class Bundle:
     def rates(self) -> np.ndarray:
         """x*' at both ends of every interval: the certificate's, which are the elite's to their rounding."""
         return self.proof.rates if self.proof else self.funnel.loop.rates
+
+    @property
+    def angles(self) -> Bool[np.ndarray, " n"]:
+        """Which states are angles, and so known only up to whole turns to many encoders."""
+        return np.array([unit == "rad" for unit in self.elite.record["units"]["states"].values()])
 
     def at(self, t: float) -> Instant:
         """The loop at a time t >= 0: u* held, K linear, x* and the funnel's axes; the goal's from t_N on."""
@@ -88,7 +96,13 @@ class Bundle:
         nothing = np.zeros(0), np.zeros((0, 4, *elite.S.shape[1:]))
         begins, axes = (self.proof.begins, self.proof.axes) if self.proof else nothing
         proof = {"proof_begins": begins, "proof_axes": axes}
-        return stored | rates | {"state_limits": elite.state_limits, "input_joints": self.joints} | proof
+        return (
+            stored
+            | rates
+            | {"state_limits": elite.state_limits, "input_joints": self.joints}
+            | proof
+            | {"angles": self.angles}
+        )
 
     def describe(self) -> dict[str, Any]:
         """What the controller's JSON holds: units, signs, limits, control rate, origin, and what is promised."""
@@ -178,6 +192,7 @@ def read_bundle(
         standing=certificate,
         proof=proof,
         control_rate=control_rate(elite, proof, lambda done, of: show(done, of, "trying control rates")),
+        robustness=borne(folder, name),
     )
 
 

@@ -12,7 +12,13 @@ from rtcd_jax.export.bundle import Bundle
 TEMPLATES = files("rtcd_jax.export") / "templates"
 PREFIX = "rtcd_"
 """Of the templates' files and symbols; the export's own name takes its place: two exports live in one program."""
-_COPIED = ("controller.py", "controller.h", "controller.c", "controller_test.c")
+_COPIED = (
+    "controller.py", "controller.h", "controller.c", "controller_test.c", "demo.py", "drake.py", "ros2.py",
+)  # fmt: skip
+NOT_TRIED = (
+    "Nothing was tried: `rtcd disturb` on the run simulates wrong models, friction, noise, delay and pushes; export "
+    "again afterwards, and what it finds stands here."
+)
 _CLAIMS = {"controller.py": 'CLAIM = ""', "controller.c": 'claim[] = ""'}
 
 
@@ -82,7 +88,9 @@ def _data_header(bundle: Bundle) -> str:
     for name, array in arrays.items():
         sizes = "".join(f"[{size}]" for size in array.shape)
         definitions.append(f"static const double RTCD_{name}{sizes} = {_initializer(array)};")
-    return _header(bundle, "RTCD_CONTROLLER_DATA_H", [*scalars, *definitions])
+    angles = ", ".join(str(int(angle)) for angle in bundle.angles)
+    flags = f"static const int RTCD_ANGLES[{bundle.angles.size}] = {{{angles}}};"
+    return _header(bundle, "RTCD_CONTROLLER_DATA_H", [*scalars, flags, *definitions])
 
 
 def readme(bundle: Bundle, described: dict[str, Any]) -> str:
@@ -103,6 +111,7 @@ def readme(bundle: Bundle, described: dict[str, Any]) -> str:
         duration=f"{bundle.elite.time[-1]:.6g}",
         rate=bundle.control_rate.sentence,
         guarantee=funnel["rung"],
+        bears=bundle.robustness or NOT_TRIED,
         promise=_promise(bundle, funnel),
         columns="`time,pos,vel,torque`" if bundle.elite.x_goal.size == 2 else "`time,pos1,…,vel1,…,tau1,…,K11,…`",
     )

@@ -14,6 +14,8 @@
 
 enum { N = RTCD_STATES, M = RTCD_INPUTS, INTERVALS = RTCD_INTERVALS };
 
+static const double TURN = 6.283185307179586;
+
 const char rtcd_claim[] = "";
 
 /* By the exponent's bits, read where the numbers lie: no assumption of the compiler about doubles applies. */
@@ -167,6 +169,18 @@ static double proved_ratio(int k, double s, const double error[N])
     return squared_length(axes, error);
 }
 #endif
+
+void rtcd_unwrap(double t, double x[RTCD_STATES])
+{
+    double s, nominal[N];
+    if (!finite_all(&t, 1) || !finite_all(x, N))
+        return;
+    const int k = place(t, &s);
+    nominal_at(k, s, nominal);
+    for (int i = 0; i < N; i++)
+        if (RTCD_ANGLES[i])
+            x[i] -= TURN * floor((x[i] - nominal[i]) / TURN + 0.5);
+}
 
 rtcd_monitor rtcd_watch(double t, const double x[RTCD_STATES], double abort_ratio)
 {

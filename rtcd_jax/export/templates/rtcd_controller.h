@@ -1,6 +1,7 @@
 /* The exported controller and its funnel monitor, C99 without allocation, state or any library but libm.
  *
- * Time [s] counts from the start of the motion; x = (positions, velocities) in SI units, angles not wrapped.
+ * Time [s] counts from the start of the motion; x = (positions, velocities) in SI units, angles not wrapped
+ * (rtcd_unwrap is for measured ones that are).
  * rtcd_controller.json has units, signs and limits; rtcd_controller_data.h has the numbers.
  *
  * Where x, t or what follows from them is not finite, the input is zero and the state counts as outside, under any
@@ -34,6 +35,10 @@ typedef struct {
 
 /* The nominal state x*(t). */
 void rtcd_nominal(double t, double x[RTCD_STATES]);
+
+/* Takes every angle of x into the turn that is nearest to x*(t), for encoders that lose whole turns: call it before the
+ * two below. */
+void rtcd_unwrap(double t, double x[RTCD_STATES]);
 
 /* u = clip(u*(t) - K(t) (x - x*(t))); zero if x or t is not finite. */
 void rtcd_control(double t, const double x[RTCD_STATES], double u[RTCD_INPUTS]);

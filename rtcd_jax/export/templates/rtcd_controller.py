@@ -4,8 +4,9 @@
     des_pos, des_vel, des_tau = controller.get_control_output(meas_pos, meas_vel, meas_tau, meas_time)
     watch = controller.monitor(meas_time, [meas_pos, meas_vel])
 
-Time counts from the start of the motion. Angles are not wrapped. `rtcd_controller.json` has units, signs and limits.
-`python rtcd_controller.py` compares the controller with `test_vectors.csv`.
+Time counts from the start of the motion. Angles are not wrapped, unless `Controller(wrapped=True)` says that the
+measured ones are. `rtcd_controller.json` has units, signs and limits. `python rtcd_controller.py` compares the
+controller with `test_vectors.csv`; with `--demo` it swings up MuJoCo's model of the robot.
 
 On [t_k, t_k+1], with s = (t - t_k) / dt:  u = clip(u_k - K(t) (x - x*(t))), x* the cubic Hermite interpolant of x_k and
 its rates, K linear between K_k and K_k+1. Before t_0 the first instant is held; from t_N on u = clip(-K_goal (x -
@@ -64,16 +65,18 @@ class Controller:
 
     `abort_ratio` is the ratio above which the monitor advises to abort; it always does beyond the limits of the states.
     4 is twice as far from the nominal motion as the funnel reaches: outside it nothing is promised, but much may work.
+    `wrapped` is for encoders that lose whole turns: every measured angle is taken in the turn nearest to the nominal.
     """
 
-    def __init__(self, folder: Path | str = Path(__file__).parent, abort_ratio: float = 4.0):
+    def __init__(self, folder: Path | str = Path(__file__).parent, abort_ratio: float = 4.0, wrapped: bool = False):
         with np.load(Path(folder) / "rtcd_controller.npz") as stored:
             time, x, rates, self.u, gains = (stored[key] for key in ("time", "x", "x_rates", "u", "K"))
             values, value_rates, levels = stored["S"], stored["S_rates"], stored["rho"]
             self.x_goal, self.goal_gain = stored["x_goal"], stored["K_goal"]
             self.u_max, self.limits, self.joints = stored["u_max"], stored["state_limits"], stored["input_joints"]
             self._begins, self._axes = stored["proof_begins"], stored["proof_axes"]
-        self.abort_ratio = abort_ratio
+            self.angles = stored["angles"]
+        self.abort_ratio, self.wrapped = abort_ratio, wrapped
         self.dt, self.duration = float(time[1]), float(time[-1])
         self._log_levels, self._last_value = np.log(levels).tolist(), values[-1] / levels[-1]
         # Coefficients of 1, s, s^2, s^3, one row an interval: of x*(t) with K(t) behind it, and of S(t).
@@ -169,9 +172,21 @@ class Controller:
         """u [inputs] of the state x as in `monitor`; zero if x or t is not finite."""
         return self._nominal_and_input(t, np.asarray(x, float).reshape(-1))[1]
 
+    def unwrap(self, t: float, x) -> np.ndarray:
+        """x with every angle in the turn that is nearest to x*(t): half a turn at most between them."""
+        x = np.array(x, float).reshape(-1)
+        if np.isfinite(x).all() and np.isfinite(t):
+            error = (x - self.nominal(t))[self.angles]
+            x[self.angles] -= 2 * np.pi * np.round(error / (2 * np.pi))
+        return x
+
+    def nominal(self, t: float) -> np.ndarray:
+        """x*(t) [n] at a finite time; after the motion the goal."""
+        return self._nominal(*self._place(t))
+
     def monitor(self, t: float, x) -> Monitor:
         """Whether x = (positions, velocities), flat or [positions, velocities], is inside the funnel at time t."""
-        x = np.asarray(x, float).reshape(-1)
+        x = self.unwrap(t, x) if self.wrapped else np.asarray(x, float).reshape(-1)
         proved = bool(len(self._begins) > 0 and np.isfinite(t) and t >= self._begins[0] * self.dt)
         if not (np.isfinite(x).all() and np.isfinite(t)):
             return Monitor(LARGEST, -LARGEST, False, True, proved)
@@ -220,6 +235,7 @@ class Controller:
 
     def _nominal_and_input(self, t: float, x: np.ndarray):
         """x*(t) and u."""
+        x = self.unwrap(t, x) if self.wrapped else x
         finite = bool(np.isfinite(x).all() and np.isfinite(t))
         k, s = self._place(t) if np.isfinite(t) else (None, 0.0)
         if k is None:
@@ -260,4 +276,8 @@ def self_test(folder: Path | str = Path(__file__).parent, tolerance: float = TOL
 
 
 if __name__ == "__main__":
+    if "--demo" in sys.argv[1:]:
+        from rtcd_demo import main
+
+        sys.exit(main([word for word in sys.argv[1:] if word != "--demo"]))
     sys.exit(0 if self_test() <= TOLERANCE else 1)
