@@ -57,6 +57,8 @@ OWNERS = {
     "orbax": {"run"},
     "evosax": {"search"},
     "optax": {"refinement"},
+    "tensorboardX": {"run.live"},
+    "wandb": {"run.live"},
     "rich": {"system.console"},
     "tyro": {"cli"},
     "yaml": {"config", "export"},

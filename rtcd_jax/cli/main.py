@@ -63,6 +63,7 @@ VERBS = {
         "search for the design and the weights with the largest funnel, or resume a search",
     ),
     "configs": Verb("rtcd_jax.cli.search_verbs:configs", "list the packaged configurations, or print one"),
+    "completion": Verb("rtcd_jax.cli.completion:completion", "print the script that completes commands in a shell"),
     "new": Verb("rtcd_jax.cli.search_verbs:new", "write a commented configuration for the robot of an MJCF"),
     "sweep": Verb(
         "rtcd_jax.cli.search_verbs:sweep", "make all the runs that a YAML's sweep section asks for, or one of them"

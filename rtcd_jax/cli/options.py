@@ -123,11 +123,7 @@ def _help(field: FieldInfo, unit: str) -> str:
 
 def _parsed(branch: Branch, words: Sequence[str], prog: str, description: str) -> dict[str, Any]:
     """The values of all options. tyro quotes words that it does not take: a terminal is to show them, not to obey."""
-    registry = ConstructorRegistry()
-    registry.struct_rule(_as_struct)
-    parse = partial(
-        tyro.cli, Branch, prog=prog, description=description, default=branch, registry=registry, use_underscores=True
-    )
+    parse = partial(parser(), Branch, prog=prog, description=description, default=branch)
     harmless = [printable(word) for word in words]
     if harmless == list(words):
         return cast(dict[str, Any], parse(args=words))
@@ -138,6 +134,13 @@ def _parsed(branch: Branch, words: Sequence[str], prog: str, description: str) -
         if end.code:
             parse(args=harmless)
         raise
+
+
+def parser() -> Callable[..., Any]:
+    """tyro's `cli`, which knows a Branch."""
+    registry = ConstructorRegistry()
+    registry.struct_rule(_as_struct)
+    return partial(tyro.cli, registry=registry, use_underscores=True)
 
 
 def _as_struct(info: StructTypeInfo) -> StructConstructorSpec | None:

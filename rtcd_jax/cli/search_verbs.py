@@ -2,8 +2,9 @@
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
+from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from pydantic import AfterValidator, Field, PlainValidator
 
@@ -23,6 +24,8 @@ if TYPE_CHECKING:
     from rtcd_jax.system.cluster import Cluster
 
 RUNS = Path("checkpoints")
+LOGS = {"tensorboard": "tensorboardX", "wandb": "wandb"}
+"""The packages that write them."""
 _UNDER_SRUN = "as srun or mpirun say"
 
 
@@ -100,6 +103,18 @@ def _configuration(data: Any) -> Config:
         raise invalid(error.problems) from None
 
 
+def _installed(kind: str | None) -> str | None:
+    package = LOGS.get(kind or "")
+    if package and find_spec(package) is None:
+        raise refusal(f"needs the package {package}: pip install 'rtcd-jax[{kind}]'")
+    return kind
+
+
+_Log = Annotated[
+    Literal["tensorboard", "wandb"] | None, AfterValidator(_installed), shown("{tensorboard,wandb}", "nowhere")
+]
+
+
 class OptimizeOptions(Options):
     """Search for the design and the weights with the largest funnel; the same command resumes a stopped run.
 
@@ -116,6 +131,9 @@ class OptimizeOptions(Options):
         default=None, description="finished run of this robot, with whose best candidate the search begins"
     )
     run: Annotated[Path, shown("FOLDER")] = Field(description="run folder, resumed if it is there")
+    log: _Log = Field(
+        default=None, description="show the generations there too, from FOLDER/tensorboard or FOLDER/wandb"
+    )
     dry: bool = Field(default=False, description="only say what is understood of the robot and its task")
     machines: Annotated[Machines, FLAT] = Machines()
 
@@ -149,7 +167,7 @@ def optimize(options: OptimizeOptions, console: Console) -> Exit:
     def search(console: Console, cluster: "Cluster") -> None:
         from rtcd_jax.run.optimize import optimize as run_optimize
 
-        worked = run_optimize(config, options.run, console, cluster)
+        worked = run_optimize(config, options.run, console, cluster, options.log)
         finish = partial(_finish_page, options.run, worked, console)
         cluster.on_first(partial(cluster.interruptible, finish))
 

@@ -16,6 +16,7 @@ from rtcd_jax.evaluation import device_chunk, make_evaluate
 from rtcd_jax.genome import initial_genome
 from rtcd_jax.problem import Problem, make_problem
 from rtcd_jax.refinement import Refinement
+from rtcd_jax.run import live
 from rtcd_jax.run.folder import RunFolder
 from rtcd_jax.run.format import arrays_of, record_of
 from rtcd_jax.run.reevaluation import Reevaluation, Reported, physics_line, row
@@ -33,10 +34,10 @@ LAST_FILE = Path("initial.json")
 """Written when all else is: a folder that has it is complete."""
 
 
-def optimize(config: Config, folder: Path, console: Console, cluster: Cluster) -> bool:
+def optimize(config: Config, folder: Path, console: Console, cluster: Cluster, log: live.Kind | None = None) -> bool:
     """Search as `config` says and leave everything in the run folder; goes on where an earlier call stopped.
 
-    Says whether anything was left to do.
+    Says whether anything was left to do. `log` shows the generations elsewhere, too, while it runs.
 
     Raises:
         UserError: the folder belongs to something else, or nothing at all is feasible.
@@ -67,16 +68,18 @@ def optimize(config: Config, folder: Path, console: Console, cluster: Cluster) -
         )
         again = Reevaluation(problem, cluster, example, console)
         state, pace = begun, _Pace(config)
-        try:
-            steps = search.run(plan, evaluate, begun, best)
-            for state, generation in iter(partial(cluster.interruptible, partial(next, steps, None)), None):
-                run.append(vars(generation))
-                run.save_if_due(state, int(state.generation))
-                console.progress(pace.progress(generation))
-                cluster.raise_if_preempted(int(state.generation))
-        except Preempted:
-            run.save(state, int(state.generation))
-            raise
+        with live.log(log if cluster.first else None, folder) as show:
+            try:
+                steps = search.run(plan, evaluate, begun, best)
+                for state, generation in iter(partial(cluster.interruptible, partial(next, steps, None)), None):
+                    run.append(vars(generation))
+                    show(vars(generation))
+                    run.save_if_due(state, int(state.generation))
+                    console.progress(pace.progress(generation))
+                    cluster.raise_if_preempted(int(state.generation))
+            except Preempted:
+                run.save(state, int(state.generation))
+                raise
         run.save(state, int(state.generation))
         if int(state.generation) < config.search.generations:
             console.message(f"no gain of {search.GAIN:.1%} in {config.search.patience} generations: the search is over")
