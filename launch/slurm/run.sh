@@ -6,11 +6,22 @@
 # On preemption, or shortly before the time limit (#SBATCH --signal=TERM@120), Slurm sends SIGTERM: rtcd saves and exits
 # with 85. With 75 it has lost one of its processes (a node failed). Both times the job goes back into the queue, and the
 # same command goes on where the state was saved. A cancelled job does not come back.
+#
+# RTCD is another program than the `rtcd` on the path; RTCD_CONTAINER=IMAGE.sif runs the one in an image, made by
+# launch/container/rtcd.def, with the node's GPUs where JAX_PLATFORMS asks for them. RTCD_APPTAINER has more options for
+# it, as `--bind /scratch`.
 set -uo pipefail
 
 trap : TERM   # this shell must outlive the signal, to requeue
 
-srun --kill-on-bad-exit=0 "${RTCD:-rtcd}" "$@"
+command=("${RTCD:-rtcd}")
+if [[ -n ${RTCD_CONTAINER:-} ]]; then
+  gpus=()
+  [[ ${JAX_PLATFORMS:-} == cuda ]] && gpus=(--nv)
+  read -ra more <<<"${RTCD_APPTAINER:-}"
+  command=(apptainer exec "${gpus[@]}" "${more[@]}" "$RTCD_CONTAINER" "${RTCD:-rtcd}")
+fi
+srun --kill-on-bad-exit=0 "${command[@]}" "$@"
 code=$?
 
 restarts=${SLURM_RESTART_COUNT:-0}

@@ -34,7 +34,7 @@ def call(*arguments, **environment):
 # ---- codes
 
 
-@pytest.mark.parametrize("path", ["README.md", "launch/README.md"])
+@pytest.mark.parametrize("path", ["docs/commands.md", "launch/README.md"])
 def test_the_documents_and_the_help_list_every_exit_code(path, capsys):
     assert cli.main(["--help"]) == 0
     shown = capsys.readouterr().out
