@@ -4,6 +4,7 @@ Nothing but the standard library is imported before a verb is known, and nothing
 """
 
 import inspect
+import os
 import sys
 from collections.abc import Sequence
 from contextlib import nullcontext
@@ -148,6 +149,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     interrupts, and ends quietly where its output is closed.
     """
     if arguments is None:
+        os.environ["MPLBACKEND"] = "agg"  # figures are files; a notebook's own backend is not in every environment
         return as_process(lambda: main(sys.argv[1:]))
     words = [word for word in arguments if word != DEBUG]
     debug = len(words) < len(arguments)

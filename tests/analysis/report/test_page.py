@@ -1,7 +1,10 @@
 """The page in a real browser: no error, no request, all figures, sorting, no sideways scroll on a phone."""
 
 import json
+import os
 import re
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -22,6 +25,7 @@ from tests.analysis.report.runs import (
     run_folder,
     verify_and_disturb,
 )
+from tests.paths import ROOT
 
 
 def written(tmp_path_factory, plants):
@@ -367,6 +371,15 @@ def test_one_run_gets_its_page_and_figures_several_get_one_beside_them(tmp_path,
     assert report([first, second], tmp_path / "mine.html") == [
         tmp_path / f"mine.{kind}" for kind in ("html", "png", "pdf")
     ]
+
+
+def test_a_report_asked_for_in_a_notebook_s_shell_is_drawn_into_files(tmp_path):
+    """Jupyter names a backend that only its own environment has."""
+    run = finished(tmp_path / "run")
+    jupyter = os.environ | {"MPLBACKEND": "module://no_such_package.backend"}
+    done = subprocess.run([sys.executable, "-m", "rtcd_jax", "report", run], cwd=ROOT, env=jupyter, capture_output=True)
+    assert done.returncode == 0, done.stderr
+    assert (run / "figures" / "overlay.png").is_file()
 
 
 def test_a_page_that_cannot_be_written_is_refused(tmp_path, figures):
