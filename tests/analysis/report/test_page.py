@@ -374,9 +374,9 @@ def test_one_run_gets_its_page_and_figures_several_get_one_beside_them(tmp_path,
 
 
 def test_a_report_asked_for_in_a_notebook_s_shell_is_drawn_into_files(tmp_path):
-    """Jupyter names a backend that only its own environment has."""
+    """Jupyter names a backend that only its own environment has, here one that ours has not."""
     run = finished(tmp_path / "run")
-    jupyter = os.environ | {"MPLBACKEND": "module://no_such_package.backend"}
+    jupyter = os.environ | {"MPLBACKEND": "module://ipympl.backend_nbagg"}
     done = subprocess.run([sys.executable, "-m", "rtcd_jax", "report", run], cwd=ROOT, env=jupyter, capture_output=True)
     assert done.returncode == 0, done.stderr
     assert (run / "figures" / "overlay.png").is_file()
