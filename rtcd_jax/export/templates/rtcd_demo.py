@@ -115,7 +115,7 @@ def main(words: list[str] | None = None, folder: Path = Path(__file__).parent) -
     controller, t, x, u, ratio = simulate(folder, options.seed, view)
     if not view:
         (folder / "demo.svg").write_text(drawing(controller, t, x, u, ratio), encoding="utf-8")
-        print(f"{folder / 'demo.svg'}: states, inputs and V/rho over time")
+        print("demo.svg, beside the controller: states, inputs and V/rho over time")
     away = np.abs(x[-1] - controller.x_goal).max()
     print(f"at {t[-1]:.2f} s: {away:.2g} from the goal, largest V/rho {ratio.max():.3g}, at the end {ratio[-1]:.2g}")
     return 0 if ratio[-1] <= 1 else 1
