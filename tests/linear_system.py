@@ -81,7 +81,7 @@ def problem_of(state_limits, limit=UNBOUNDED, intervals=10, **funnel) -> Problem
     data["funnel"] = sampling | funnel
     plant = Unstable(limit)
     limits = np.array(state_limits, float)
-    return Problem(configuration.parse(data), plant, np.zeros(2), np.zeros(2), limits, np.array([limit]), ())
+    return Problem(configuration.parse(data), plant, np.zeros(2), np.zeros(2), limits, ())
 
 
 def candidate() -> Candidate:

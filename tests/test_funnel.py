@@ -26,8 +26,6 @@ from tests import pipeline
 from tests.paths import CONFIGS
 
 RADII = np.array([0.1, 0.2, 0.4, 0.8])
-MOVING = (0, 5, 6)
-"""Motions of the linear robot whose levels end at boxes at a knot, behind it, and at the next level."""
 
 
 def _crossing(bad) -> float:
@@ -157,7 +155,7 @@ def _moving(seed: int):
     return levels[:-1], exact[:-1], np.isclose(exact[:-1], boxed, rtol=1e-9)
 
 
-@pytest.mark.parametrize("seed", MOVING)
+@pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (5, 6))])
 def test_a_moving_funnel_is_that_of_linear_algebra(seed):
     """Some levels end at a box at their knot, some at a box behind it, some at the next level."""
     levels, exact, boxed = _moving(seed)
@@ -258,8 +256,7 @@ def test_a_region_far_smaller_than_the_box_is_found(radius, status):
     """The box is that of 1000 times the radius 1 at which the input saturates; a thousandth of that counts as empty."""
     data = yaml.safe_load(configuration.EXAMPLE) | {"trajectory": {"knots": 4}, "funnel": {"goal": {"rounds": 6}}}
     plant = Cubic(radius=radius)
-    limits = np.array([1e9]), np.array([1.0])
-    problem = Problem(configuration.parse(data), plant, np.zeros(1), np.zeros(1), *limits, ())
+    problem = Problem(configuration.parse(data), plant, np.zeros(1), np.zeros(1), np.array([1e9]), ())
     zero, one = jnp.zeros((), jnp.int32), jnp.ones((4, 1, 1))
     rest = Trajectory(jnp.zeros((3, 1)), jnp.zeros((4, 1)), jnp.asarray(0.1), *jnp.zeros((2,)), zero, zero)
     candidate = Candidate(linear.Nothing(), jnp.ones(1), jnp.ones(1))
@@ -289,10 +286,18 @@ def test_the_first_failure_is_kept(status):
     assert _boxed()(_with(failed, values=jnp.nan * failed.values)).status == status
 
 
-@pytest.mark.parametrize("limits", [(np.inf, np.inf), (np.inf, 20), (1e4, 1e4), (1e6, 1e6)])
+@cache
+def _saturating(*box):
+    return _estimator(linear.problem_of(box, limit=1.0))(RESTING)
+
+
+@pytest.mark.parametrize(
+    "limits",
+    [(np.inf, np.inf), (1e6, 1e6), *(pytest.param(box, marks=pytest.mark.slow) for box in ((np.inf, 20), (1e4, 1e4)))],
+)
 def test_without_limits_a_funnel_is_that_within_limits_that_never_bind(limits):
     """Of a saturated robot, whose input alone bounds the goal's region."""
-    near, far = (_estimator(linear.problem_of(box, limit=1.0))(RESTING) for box in ((1.0, 3.0), limits))
+    near, far = _saturating(1.0, 3.0), _saturating(*limits)
     assert far.status == Status.OK
     np.testing.assert_allclose(far.levels, near.levels, rtol=0.02)
 
@@ -352,6 +357,7 @@ def _assert_resolved(fine, coarse):
     np.testing.assert_allclose(totals, coarse_totals, rtol=0.02)
 
 
+@pytest.mark.slow
 def test_a_generations_levels_are_resolved():
     _assert_resolved(_known(_doubled(search_budget(pipeline.problem()), "directions")), _generations())
 

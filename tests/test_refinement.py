@@ -61,9 +61,8 @@ def scalar() -> tuple[Refinement, list]:
     data = yaml.safe_load(configuration.EXAMPLE) | {"trajectory": {"knots": 5}}
     may = uncertainty(residual=0.5, noise=(0.0,), input=PUSH)
     zero = np.zeros(1)
-    problem = Problem(
-        configuration.parse(data), Scalar(cubic=1.0), zero, zero, np.array([1.5]), np.array([1e-9]), (), may
-    )  # fmt: skip
+    plant = Scalar(cubic=1.0, limit=1e-9)
+    problem = Problem(configuration.parse(data), plant, zero, zero, np.array([1.5]), (), may)
     refinement = Refinement(problem, 40)
     return refinement, programs(refinement)
 

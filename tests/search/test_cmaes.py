@@ -23,6 +23,9 @@ def rastrigin(x):
     return jnp.sum(z**2 - 10 * jnp.cos(2 * jnp.pi * z) + 10, axis=-1)
 
 
+ask, tell = (jax.jit(function, static_argnums=0) for function in (cmaes.ask, cmaes.tell))
+
+
 def generation(strategy, cost, state, key):
     draw, anew = jax.random.split(key)
     state, points = cmaes.ask(strategy, state, draw)
@@ -47,8 +50,8 @@ def runs(strategy, cost, seeds, generations, mean):
 
 def told(strategy, state, costs, key=0):
     """One generation with costs that are given, whatever the points."""
-    state, points = cmaes.ask(strategy, state, jax.random.key(key))
-    return cmaes.tell(strategy, state, points, jnp.asarray(costs)), points
+    state, points = ask(strategy, state, jax.random.key(key))
+    return tell(strategy, state, points, jnp.asarray(costs)), points
 
 
 def same(left, right):
@@ -73,6 +76,7 @@ def test_ellipsoid_needs_at_most_twice_the_evaluations_of_pycma():
     assert np.median(ours) <= 2 * np.median([pycma(seed) for seed in range(1, 6)])
 
 
+@pytest.mark.slow
 def test_rotated_ellipsoid_with_its_optimum_on_the_bounds_is_solved_from_every_seed():
     center = np.linspace(-0.3, 1.2, 10)
     oracle = lsq_linear(AXES.T, AXES.T @ center, bounds=(0, 1), tol=1e-14)
@@ -84,6 +88,7 @@ def test_rotated_ellipsoid_with_its_optimum_on_the_bounds_is_solved_from_every_s
     np.testing.assert_allclose(np.min(costs, axis=1), best, rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_a_larger_population_solves_rastrigin_more_often():
     def solved(population):
         strategy = Strategy(5, population, 0.3)
@@ -109,11 +114,11 @@ def test_restarts_find_what_one_search_misses():
 
 def test_the_first_population_has_the_mean_itself_as_its_first_member():
     strategy, mean = Strategy(3, 6, 0.3), jnp.array([0.0, 0.25, 1.0])
-    state, points = cmaes.ask(strategy, cmaes.start(strategy, mean), jax.random.key(1))
+    state, points = ask(strategy, cmaes.start(strategy, mean), jax.random.key(1))
     assert np.array_equal(points[0], mean)
     assert not np.any(np.all(points[1:] == mean, axis=1))
-    state = cmaes.tell(strategy, state, points, rastrigin(points))
-    _, points = cmaes.ask(strategy, state, jax.random.key(2))
+    state = tell(strategy, state, points, rastrigin(points))
+    _, points = ask(strategy, state, jax.random.key(2))
     assert not np.any(np.all(points == state.evolution.mean, axis=1))
 
 
@@ -134,14 +139,14 @@ def test_a_search_in_which_all_fails_stays_finite_near_the_box_and_starts_anew_e
 def test_failures_rank_last_whatever_their_number():
     """Tied ranks would give failed points the weights of good ones; only the feasible half may move the mean."""
     strategy, mean = Strategy(2, 16, 0.05), jnp.full(2, 0.5)
-    state, points = cmaes.ask(strategy, cmaes.start(strategy, mean), jax.random.key(3))
+    state, points = ask(strategy, cmaes.start(strategy, mean), jax.random.key(3))
     good = np.argsort(points[:, 0])[-8:]
     costs = np.full(16, np.nan)
     costs[good] = -np.asarray(points)[good, 0]
-    after = cmaes.tell(strategy, state, points, jnp.asarray(costs))
+    after = tell(strategy, state, points, jnp.asarray(costs))
     assert after.evolution.mean[0] > np.median(points[:, 0])
     others = np.where(np.isnan(costs), 1e300, costs)
-    assert same(cmaes.tell(strategy, state, points, jnp.asarray(others)).evolution.mean, after.evolution.mean)
+    assert same(tell(strategy, state, points, jnp.asarray(others)).evolution.mean, after.evolution.mean)
 
 
 def test_tied_costs_take_every_weight_once():
@@ -151,23 +156,23 @@ def test_tied_costs_take_every_weight_once():
     ordered, _ = told(strategy, begin, 1e-13 * jnp.arange(12))
     assert jnp.all(jnp.isfinite(flat.evolution.C))
     inside = jnp.full(4, 0.5) * jnp.ones((12, 1)) + 0.01 * jax.random.normal(jax.random.key(0), (12, 4))
-    flat, ordered = (cmaes.tell(strategy, begin, inside, c) for c in (jnp.zeros(12), 1e-13 * jnp.arange(12)))
+    flat, ordered = (tell(strategy, begin, inside, c) for c in (jnp.zeros(12), 1e-13 * jnp.arange(12)))
     assert same(flat.evolution, ordered.evolution)
 
 
 def test_only_the_order_of_the_costs_matters_inside_the_box():
     strategy = Strategy(3, 8, 0.05)
-    state, points = cmaes.ask(strategy, cmaes.start(strategy, jnp.full(3, 0.5)), jax.random.key(0))
+    state, points = ask(strategy, cmaes.start(strategy, jnp.full(3, 0.5)), jax.random.key(0))
     assert jnp.all(points == cmaes.clip(points))
     costs = jnp.linspace(-4, 3, 8)[jax.random.permutation(jax.random.key(1), 8)]
-    left, right = (cmaes.tell(strategy, state, points, c).evolution for c in (costs, jnp.exp(costs) - 7))
+    left, right = (tell(strategy, state, points, c).evolution for c in (costs, jnp.exp(costs) - 7))
     assert same((left.mean, left.std, left.C), (right.mean, right.std, right.C))
 
 
 def test_a_point_outside_the_box_loses_against_its_equal_inside():
     strategy = Strategy(1, 4, 0.3)
     points = jnp.array([[1.4], [0.9], [1.2], [0.95]])
-    after = cmaes.tell(strategy, cmaes.start(strategy, jnp.ones(1)), points, jnp.zeros(4))
+    after = tell(strategy, cmaes.start(strategy, jnp.ones(1)), points, jnp.zeros(4))
     assert after.evolution.mean[0] < 1
 
 

@@ -1,6 +1,6 @@
 """The obligations of one interval of the funnel: d/dt |y|^2 < 0 on |y| = 1, for every robot and case of the input."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any, NamedTuple
 
 from rtcd_jax.certificate.check.claim import Claim
@@ -82,9 +82,7 @@ def funnel_obligations(claim: Claim, interval: Interval, place: str) -> dict[str
     if claim.age != 0:
         require_speed(claim, funnel_speed(claim, interval, place), place)
     y = [space.y(i) for i in range(claim.n)]
-    error = [dot(row, y) for row in data.axes]
-    x = [Taylor(space, center + e).tidy() for center, e in zip(data.state, error, strict=True)]
-    field = field_of(claim, x, waves_near(claim, x, place), place)
+    error, field = field_around(claim, space, data.state, data.axes, place)
     scaled = [dot(column, y) for column in zip(*adjugate, strict=True)]
     push = pushes(field, scaled, Taylor(space, determinant).constant, place)
     drag = [Taylor(space, a + dot(row, y)).tidy() for a, row in zip(data.rate, data.axes_rate, strict=True)]
@@ -145,6 +143,14 @@ def field_of(claim: Claim, x: list[Taylor], values: Mapping[tuple[int, ...], tup
     return Field(space.enclose(d), [space.enclose(each) for each in a], [space.enclose(each) for each in b], x, waves)
 
 
+def field_around(claim: Claim, space: Any, center: Iterable, axes: list, place: str) -> tuple[list, Field]:
+    """e = L y, and the field at the states center + e."""
+    y = [space.y(i) for i in range(claim.n)]
+    error = [dot(row, y) for row in axes]
+    x = [Taylor(space, c + e).tidy() for c, e in zip(center, error, strict=True)]
+    return error, field_of(claim, x, waves_near(claim, x, place), place)
+
+
 def angle_of(k: tuple[int, ...], x: list) -> Any:
     """k.q."""
     return dot([x[i] for i, a in enumerate(k) if a], [Q(a) for a in k if a])
@@ -178,9 +184,7 @@ def pushed(push: list[Taylor], field: list[Taylor]) -> Taylor:
 def funnel_speed(claim: Claim, interval: Interval, place: str) -> Any:
     """An upper bound of |d/dt (K e)| in the ellipsoids of an interval, e = x - x*."""
     data, space = motion(claim, interval), claim.space(*interval.orders)
-    error = [dot(row, [space.y(i) for i in range(claim.n)]) for row in data.axes]
-    x = [Taylor(space, center + e).tidy() for center, e in zip(data.state, error, strict=True)]
-    field = field_of(claim, x, waves_near(claim, x, place), place)
+    error, field = field_around(claim, space, data.state, data.axes, place)
     rate = [a - field.d * Taylor(space, slow) for a, slow in zip(field.a, data.rate, strict=True)]
     turning = dot([Taylor(space, gain) for gain in data.gain_rate], [Taylor(space, e) for e in error])
     return turning.largest + speed_of(claim, field, [Taylor(space, gain) for gain in data.gain], rate, place)
@@ -194,9 +198,7 @@ def late_row(space: Any, interval: Interval) -> list:
 def funnel_delay(claim: Claim, interval: Interval, place: str) -> DelayBounds:
     """The bounds of delay.py on the ellipsoids of an interval."""
     data, space = motion(claim, interval), claim.space(*interval.orders)
-    error = [dot(row, [space.y(i) for i in range(claim.n)]) for row in data.axes]
-    x = [Taylor(space, center + e).tidy() for center, e in zip(data.state, error, strict=True)]
-    field = field_of(claim, x, waves_near(claim, x, place), place)
+    error, field = field_around(claim, space, data.state, data.axes, place)
     late, row = input_error(claim, interval.knot), _models(space, late_row(space, interval))
     return delay_bounds(claim, along(claim, data, field, error), late, row, place)
 
@@ -229,9 +231,7 @@ def require_jump(claim: Claim, interval: Interval, place: str) -> None:
 def funnel_jump(claim: Claim, interval: Interval, place: str) -> Any:
     """The bound of the jump at the knot where an interval begins."""
     space, k = claim.space(*interval.orders), interval.knot
-    error = [dot(row, [space.y(i) for i in range(claim.n)]) for row in interval.first]
-    x = [Taylor(space, space.poly(center) + e).tidy() for center, e in zip(claim.x[k], error, strict=True)]
-    field = field_of(claim, x, waves_near(claim, x, place), place)
+    error, field = field_around(claim, space, map(space.poly, claim.x[k]), interval.first, place)
     gain = [Taylor(space, space.poly(each)) for each in claim.K[k]]
     here = scaled_along(field, _models(space, error), gain, gain, gain, gain, claim.u[k])
     return jump_bound(claim, here, k, place)
