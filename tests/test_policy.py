@@ -253,8 +253,8 @@ def test_options_solve_their_own_riccati_equation(problem, cautious, candidates,
             lambda t, v, k=k: rate(k, np.asarray(1 - t / h), v.reshape(2, 2), inputs[k], weights[k]).ravel(),
             (0, h),
             s[k + 1].ravel(),
-            rtol=1e-10,
-            atol=1e-10,
+            rtol=1e-7,
+            atol=1e-7,
         ).y[:, -1]
         np.testing.assert_allclose(found.reshape(2, 2), s[k], rtol=3e-3)  # five substeps an interval
         _, b = linearize(problem, soft, trajectory.xs[k], trajectory.us[k])
