@@ -1,5 +1,3 @@
-from functools import cache
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -24,15 +22,10 @@ def nothing(capacity=CAPACITY, dimensions=2):
     return elites.empty(capacity, random_population(0, dimensions=dimensions))
 
 
-@cache
-def merge(objective):
-    return jax.jit(lambda archive, *rest: elites.merge(archive, rest[0], SearchConfig(objective=objective), *rest[1:]))
-
-
 def merged(populations, capacity=CAPACITY, distance=DISTANCE, objective="sum"):
     archive = nothing(capacity, populations[0].genome.shape[1])
     for generation, evaluation in enumerate(populations):
-        archive = merge(objective)(archive, evaluation, generation, distance)
+        archive = elites.merge(archive, evaluation, SearchConfig(objective=objective), generation, distance)
     return archive
 
 
