@@ -206,9 +206,11 @@ class ToleranceOptions(Options):
     """Find the largest factor of every uncertainty, and of all at once, under which an elite's policy has a funnel.
 
     The box is the run's `uncertainty`, or that of a YAML file. Results: a table, and tolerance/NNN.json, .csv, .png and
-    .pdf in the run folder; all factors are sampled, within 1 %.
+    .pdf in the run folder; all factors are sampled, within 1 %. With --prove the whole box is proved, too, within
+    5 %, by some ten certificates, of which tolerance/certificates/NNN.json is the largest that holds.
 
     Example: rtcd tolerance checkpoints/pendulum_robust --uncertainty lab.yaml
+    Example: rtcd tolerance checkpoints/pendulum_robust --prove
     """
 
     run: Run = Field(description="the run folder")
@@ -216,13 +218,14 @@ class ToleranceOptions(Options):
     uncertainty: Annotated[Path | None, shown("FILE", "the run's own")] = Field(
         default=None, description="a YAML with an `uncertainty` section, whose half widths are the factor 1"
     )
+    prove: bool = Field(default=False, description="also the largest factor of the whole box that is proved")
     cache: Cache = Field(default=None, description="of compiled programs, '' for none")
 
 
 def tolerance(options: ToleranceOptions, console: Console) -> Exit:
     from rtcd_jax.analysis.tolerance.study import tolerance_run
 
-    tolerance_run(options.run, options.elite, options.uncertainty, console)
+    tolerance_run(options.run, options.elite, options.uncertainty, console, options.prove)
     return Exit.OK
 
 

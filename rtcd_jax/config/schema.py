@@ -235,6 +235,14 @@ class UncertaintyConfig(Settings):
         widths = (*self.design.values(), *self.plant.values(), *self.noise, self.input_limit, self.input, self.age)
         return not any(widths)
 
+    def times(self, factor: float) -> "UncertaintyConfig":
+        """The box with all half widths multiplied."""
+        shares = {
+            section: {k: factor * v for k, v in getattr(self, section).items()} for section in ("design", "plant")
+        }
+        widths = {name: factor * getattr(self, name) for name in ("input_limit", "input", "age")}
+        return self.model_copy(update=shares | widths | {"noise": tuple(factor * error for error in self.noise)})
+
     def in_words(self, plant: PlantConfig) -> str:
         """The box as every result of the robot states it."""
         if self.empty:

@@ -9,6 +9,7 @@
 Numbers that are not finite are stored as null.
 """
 
+import hashlib
 import io
 import json
 from collections.abc import Mapping
@@ -40,6 +41,12 @@ def elite_name(which: int | str) -> str:
 def elite_folder(run: Path, name: str) -> Path:
     """Where in a run folder the files of the elite "000", "001", … or of the candidate "initial" lie."""
     return run if name == INITIAL else run / "elites"
+
+
+def elite_digests(run: Path, name: str) -> list[str]:
+    """The SHA-256 of an elite's two files: what was made of it holds as long as these are the same."""
+    files = [elite_folder(run, name) / f"{name}.{suffix}" for suffix in ("npz", "json")]
+    return [hashlib.sha256(file.read_bytes()).hexdigest() for file in files]
 
 
 def write_elite(folder: Path, name: str, arrays: Arrays, record: Record) -> None:

@@ -52,7 +52,7 @@ _VERIFICATION = {
     "states": _NUMBER, "epsilon": _NUMBER, "confidence": _NUMBER, "witnesses": {_ANY_KEY: _COUNTS},
 }  # fmt: skip
 _DISTURBANCE = {"summary": {}}
-_TOLERATED = {"name": str, "unit": str, "half_width": _NUMBER, "factor": _NUMBER, "borne": _NUMBER}
+_TOLERATED = {"name": str, "unit": str, "half_width": _NUMBER, "factor": _NUMBER, "borne": _NUMBER, "guarantee": str}
 _TOLERANCE = {"rows": [{**_TOLERATED, "volumes": {_ANY_KEY: _NUMBER}}]}
 
 

@@ -182,7 +182,11 @@ def tolerance(run: Run, tolerated: Tolerance) -> Table:
     heads = ("uncertainty", "unit", "half width", "largest factor", "borne", *volumes, "guarantee")
     keys = ("name", "unit", "half_width", "factor", "borne")
     rows = [
-        (*(row.get(key) for key in keys), *(row.get("volumes", {}).get(name) for name in VOLUMES), "sampled")
+        (
+            *(row.get(key) for key in keys),
+            *(row.get("volumes", {}).get(name) for name in VOLUMES),
+            row.get("guarantee", "sampled"),
+        )
         for row in tolerated.rows
     ]
     return Table(heads, tuple(rows))

@@ -13,7 +13,9 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from rtcd_jax.analysis.tolerance.box import Side, sides, stacked, with_box
+from rtcd_jax.analysis.tolerance.factors import MOST, PRECISE, is_open, largest_factors
 from rtcd_jax.analysis.tolerance.figures import draw_tolerance
+from rtcd_jax.analysis.tolerance.proved import proved_factor
 from rtcd_jax.elite.elite import Elite
 from rtcd_jax.elite.records import elite_name, read_config
 from rtcd_jax.evaluation import elite_key, search_budget
@@ -27,19 +29,14 @@ from rtcd_jax.system.files import make_folder, replace, replace_json
 from rtcd_jax.types import Candidate, Status, Uncertainty
 from rtcd_jax.volume import VOLUMES, funnel_volume
 
-PRECISE = 1.01
-"""Ratio of the smallest factor that is not borne to the largest one that is."""
-LEAST, MOST = 1e-3, 1e4
-"""Factors that are tried."""
 FOLDER = "tolerance"
 
-Bears = Callable[[Float[np.ndarray, " B"]], Bool[np.ndarray, " B"]]
 
-
-def tolerance_run(folder: Path, which: int | str, file: Path | None, console: Console) -> None:
+def tolerance_run(folder: Path, which: int | str, file: Path | None, console: Console, prove: bool = False) -> None:
     """Stores `tolerance/NNN.json`, `.csv` and the figure of one elite, and shows the table.
 
-    The box is the run's, or that of the YAML `file`.
+    The box is the run's, or that of the YAML `file`. Where it is to `prove`, the whole box has a second row, and what
+    was proved lies in `tolerance/certificates`.
 
     Raises:
         UserError: no run folder, no such elite or one without a funnel, a box that is wrong or empty, or a folder that
@@ -58,42 +55,17 @@ def tolerance_run(folder: Path, which: int | str, file: Path | None, console: Co
     factors = largest_factors(bears, np.array([side.most for side in boxes]), _teller(boxes, console))
     _, volumes = evaluate(stacked(boxes, factors))
     numbers = {name: np.asarray(values) for name, values in volumes.items()}
-    record = {"elite": elite_name(which), "config_hash": elite.record.get("config_hash"), "rung": "sampled",
-              "uncertainty": problem.config.uncertainty.model_dump(), "precision": PRECISE - 1,
-              "rows": _rows(boxes, factors, numbers)}  # fmt: skip
-    place, name = folder / FOLDER, elite_name(which)
+    place, name, box = folder / FOLDER, elite_name(which), problem.config.uncertainty
+    rows = _rows(boxes, factors, numbers)
+    if prove:
+        rows.append(rows[-1] | proved_factor(folder, FOLDER, name, box, boxes[-1].most, console))
+    record = {"elite": name, "config_hash": elite.record.get("config_hash"), "rung": "sampled",
+              "uncertainty": box.model_dump(), "precision": PRECISE - 1, "rows": rows}  # fmt: skip
     replace_json(place / f"{name}.json", record)
     replace(place / f"{name}.csv", _csv(record["rows"]).encode())
     draw_tolerance(place, name, record)
     console.message(_table(record["rows"]))
     console.message(f"stored: {place}/{name}.json, .csv, .png and .pdf")
-
-
-def largest_factors(
-    bears: Bears, most: Float[np.ndarray, " B"], tell: Callable[[np.ndarray, np.ndarray], None]
-) -> Float[np.ndarray, " B"]:
-    """For each box the largest factor at which `bears` holds, within PRECISE; 0 where it does not even at LEAST.
-
-    Factors double until one is not borne, or `most` is, or halve until one is; then the bracket is halved on a log
-    scale, all boxes at once. What a smaller box has lost a larger one does not regain. `tell(low, high)` hears of the
-    brackets.
-    """
-    most = np.minimum(most, MOST)
-    low, high = np.zeros_like(most), np.where(bears(np.zeros_like(most)), np.inf, 0.0)
-    while np.any(open_ := _open(low, high, most)):
-        finite = np.where(np.isinf(high), 1.0, high)
-        between = np.where(low > 0, np.sqrt(low * finite), finite / 2)
-        tried = np.minimum(np.where(np.isinf(high), np.maximum(1.0, 2 * low), between), most)
-        tried = np.where(open_, tried, low)
-        borne = bears(tried)
-        low, high = np.where(open_ & borne, tried, low), np.where(open_ & ~borne, tried, high)
-        tell(low, high)
-    return low
-
-
-def _open(low: np.ndarray, high: np.ndarray, most: np.ndarray) -> np.ndarray:
-    """Whose bracket is too wide: neither narrow, nor all that is tried borne, nor the least of it lost."""
-    return (high > PRECISE * low) & (low < most) & (high > LEAST)
 
 
 def _teller(boxes: Sequence[Side], console: Console) -> Callable[[np.ndarray, np.ndarray], None]:
@@ -103,7 +75,7 @@ def _teller(boxes: Sequence[Side], console: Console) -> Callable[[np.ndarray, np
     def tell(low: np.ndarray, high: np.ndarray) -> None:
         nonlocal rounds
         rounds += 1
-        known = int(np.sum(~_open(low, high, most)))
+        known = int(np.sum(~is_open(low, high, most)))
         whole = f"{boxes[-1].name} between {low[-1]:.3g} and {high[-1]:.3g}"
         text = f"round {rounds}: {known}/{len(boxes)} factors known, {whole}  elapsed {duration(clock.elapsed)}"
         console.progress(Progress(known, len(boxes), text))
@@ -146,6 +118,7 @@ def _rows(boxes: Sequence[Side], factors: np.ndarray, volumes: dict[str, np.ndar
             "borne": None if side.width is None else float(factor) * side.width,
             "at_most": bool(factor >= min(side.most, MOST)),
             "volumes": {name: float(volumes[name][i]) for name in VOLUMES},
+            "guarantee": "sampled",
         }
         for i, (side, factor) in enumerate(zip(boxes, factors, strict=True))
     ]
@@ -153,10 +126,12 @@ def _rows(boxes: Sequence[Side], factors: np.ndarray, volumes: dict[str, np.ndar
 
 def _csv(rows: Sequence[dict[str, Any]]) -> str:
     text = io.StringIO()
-    columns = ("name", "unit", "half_width", "factor", "borne")
+    columns = ("name", "unit", "half_width", "factor", "borne", "guarantee")
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow([*columns, *VOLUMES])
-    writer.writerows([*(row[name] for name in columns), *row["volumes"].values()] for row in rows)
+    writer.writerows(
+        [*(row[name] for name in columns), *(row["volumes"].get(name) for name in VOLUMES)] for row in rows
+    )
     return text.getvalue()
 
 
@@ -167,8 +142,8 @@ def _table(rows: Sequence[dict[str, Any]]) -> str:
             "" if row["half_width"] is None else f"± {row['half_width']:.3g} {row['unit']}",
             f"{'≥ ' if row['at_most'] else ''}{row['factor']:.3g}",
             "" if row["borne"] is None else f"± {row['borne']:.3g} {row['unit']}",
-            *(f"{row['volumes'][name]:.3g}" for name in ("sum", "inlet", "push")),
-            "sampled",
+            *(f"{row['volumes'][name]:.3g}" if name in row["volumes"] else "" for name in ("sum", "inlet", "push")),
+            row["guarantee"],
         ]
         for row in rows
     ]

@@ -1,7 +1,6 @@
 """`rtcd verify`: all chunks of a run's trials on all cores; a stopped one goes on from its journals."""
 
 import functools
-import hashlib
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import as_completed
 from dataclasses import asdict, fields
@@ -13,7 +12,7 @@ import numpy as np
 from rtcd_jax.analysis.verify.verification import Trial, Verification
 from rtcd_jax.elite.closed_loop import Outcome
 from rtcd_jax.elite.elite import Elite, NoFunnel
-from rtcd_jax.elite.records import INITIAL, elite_folder, require_elites
+from rtcd_jax.elite.records import INITIAL, elite_digests, require_elites
 from rtcd_jax.system.console import Clock, Console, Progress, table
 from rtcd_jax.system.files import make_folder, plain, replace_json
 from rtcd_jax.system.journal import Journal
@@ -84,9 +83,7 @@ def _trial(folder: Path, funnel: str, states: int, seed: int) -> Trial:
 
 def _journal(run: Path, funnel: str, trial: Trial) -> Journal:
     """Of a funnel's finished chunks; its head is all that their outcomes depend on."""
-    files = [elite_folder(run, funnel) / f"{funnel}.{suffix}" for suffix in ("npz", "json")]
-    digests = [hashlib.sha256(file.read_bytes()).hexdigest() for file in files]
-    head = {"funnel": digests, "states": trial.states, "seed": trial.seed, "chunks": trial.chunks}
+    head = {"funnel": elite_digests(run, funnel), "states": trial.states, "seed": trial.seed, "chunks": trial.chunks}
     return Journal(run / "verification" / f".{funnel}.partial.jsonl", head)
 
 

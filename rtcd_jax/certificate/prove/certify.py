@@ -21,6 +21,7 @@ from rtcd_jax.certificate.prove.margins import feedback_delay, push_margin
 from rtcd_jax.certificate.prove.sdp import SOLVER
 from rtcd_jax.certificate.prove.uncertainty import bounds_of, uncertainty_of
 from rtcd_jax.certificate.standing import accepted, remember
+from rtcd_jax.config.schema import UncertaintyConfig
 from rtcd_jax.elite.elite import Elite
 from rtcd_jax.system.files import replace
 from rtcd_jax.system.journal import Journal
@@ -67,20 +68,21 @@ def certify_elite(
     guarantee: str,
     on_step: Callable[[Step], None],
     optimize_value: bool = False,
-    uncertainty: Path | None = None,
+    uncertainty: Path | UncertaintyConfig | None = None,
     solver: str = SOLVER,
+    target: str = "certificates",
 ) -> Outcome | None:
-    """Writes `certificates/NAME.json` of a run folder; None if not even a goal region can be shown.
+    """Writes NAME.json into a run's folder `target`; None if not even a goal region can be shown.
 
     `optimize_value` chooses the ellipsoids' shapes so that the funnel is large. The certificate bears what the run
-    bore, or the `uncertainty` of a file. `solver` is by cvxpy's name.
+    bore, or another `uncertainty`, or that of a file. `solver` is by cvxpy's name.
 
     Raises:
         UserError: an elite that is not there, or of a plant that the checker does not know.
     """
     began = time.perf_counter()
     elite = Elite.read(run, name)
-    bounds, folder = bounds_of(elite, uncertainty_of(elite, uncertainty)), run / "certificates"
+    bounds, folder = bounds_of(elite, uncertainty_of(elite, uncertainty)), run / target
     loop_record = claim_of(elite, bounds)
     misfits: tuple[Any, ...] = ()
     if bounds.age:

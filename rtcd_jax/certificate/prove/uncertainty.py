@@ -50,12 +50,14 @@ def bounds_of(elite: Elite, uncertainty: UncertaintyConfig) -> Bounds:
     )
 
 
-def uncertainty_of(elite: Elite, source: Path | None) -> UncertaintyConfig:
-    """What an elite's certificate is to bear: what its run bore, or what a file says, of which NONE says nothing.
+def uncertainty_of(elite: Elite, source: Path | UncertaintyConfig | None) -> UncertaintyConfig:
+    """What an elite's certificate is to bear: what its run bore, or else `source`, of whose files NONE says nothing.
 
     Raises:
         UserError: a file or a record that cannot be read.
     """
+    if isinstance(source, UncertaintyConfig):
+        return source
     if source is not None:
         return UncertaintyConfig() if str(source) == NONE else load_uncertainty(source)
     stored = elite.record.get("uncertainty")

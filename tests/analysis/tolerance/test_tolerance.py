@@ -6,7 +6,8 @@ import pytest
 import yaml
 
 from rtcd_jax.analysis.tolerance.box import WHOLE, sides, stacked, with_box
-from rtcd_jax.analysis.tolerance.study import LEAST, PRECISE, largest_factors, tolerance_run
+from rtcd_jax.analysis.tolerance.factors import LEAST, PRECISE, largest_factors
+from rtcd_jax.analysis.tolerance.study import tolerance_run
 from rtcd_jax.config.load import parse, resolved
 from rtcd_jax.problem import make_problem
 from rtcd_jax.system.errors import UserError
@@ -22,28 +23,24 @@ BOX = {
 }  # fmt: skip
 
 
-def silent(low, high):
-    """Hears of brackets."""
-
-
 def test_the_largest_factor_is_found_within_the_precision_over_seven_decades():
     truth = np.array([LEAST / 3, 0.02, 0.9, 1.0, 3.7, 50.0, 1e9, 5.0])
     most = np.array([np.inf] * 6 + [33.0, 2.0])
-    found = largest_factors(lambda factors: factors <= truth, most, silent)
+    found = largest_factors(lambda factors: factors <= truth, most)
     assert found[0] == 0
     assert np.all((found[1:6] <= truth[1:6]) & (truth[1:6] < PRECISE * found[1:6]))
     assert found[6:].tolist() == [33.0, 2.0]
 
 
 def test_what_has_no_funnel_even_without_uncertainty_bears_nothing():
-    assert largest_factors(lambda factors: factors < 0, np.array([np.inf]), silent).tolist() == [0.0]
+    assert largest_factors(lambda factors: factors < 0, np.array([np.inf])).tolist() == [0.0]
 
 
 def test_a_disturbance_is_borne_up_to_the_known_one():
     """x' = -x + w within |x| <= LIMIT bears |w| <= LIMIT, all at once in one program."""
     box = uncertainty(residual=0.999, noise=(0.0,), input=LIMIT / 2)
     estimate = jax.jit(jax.vmap(lambda factor: scalar_funnel(0.0, box.times(factor)).status))
-    (found,) = largest_factors(lambda factors: np.asarray(estimate(factors)) == Status.OK, np.array([np.inf]), silent)
+    (found,) = largest_factors(lambda factors: np.asarray(estimate(factors)) == Status.OK, np.array([np.inf]))
     assert found == pytest.approx(2, rel=2 * (PRECISE - 1))
 
 
