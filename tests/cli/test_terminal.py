@@ -9,6 +9,7 @@ import yaml
 
 from rtcd_jax.cli import main as cli
 from rtcd_jax.cli.exits import Exit
+from rtcd_jax.config.plants import PLANTS
 from rtcd_jax.elite.records import read_elite
 from tests.certificate.test_audit import ARGUMENTS, table
 from tests.cli.terminal import BAR, in_terminal
@@ -90,6 +91,19 @@ def test_the_packaged_configurations(folder):
     code, screen = in_terminal("configs", folder=folder)
     ends_well(code, screen, draws=False)
     assert "pendulum_rtcd" in screen
+
+
+def test_a_draft_for_a_robot(folder):
+    (folder / "acrobot.xml").write_text(PLANTS["acrobot"].xml)
+    ends_well(*in_terminal("new", "acrobot.xml", folder=folder), draws=False)
+    assert (folder / "acrobot.yaml").is_file()
+
+
+@pytest.mark.slow
+def test_a_refinement(folder):
+    shutil.copytree(folder / "run", folder / "refined")
+    code, screen = in_terminal("refine", "refined", "--steps", "2", folder=folder)
+    ends_well(code, screen, draws=True)
 
 
 def test_a_certificate_is_checked_and_falsified(sent, folder):

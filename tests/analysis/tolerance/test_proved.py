@@ -24,6 +24,7 @@ def run(tmp_path_factory):
     return folder_with(tmp_path_factory.mktemp("proved"), *swing.elite())
 
 
+@pytest.mark.slow
 def test_the_largest_proved_box_has_its_certificate(run, monkeypatch):
     """Killed in between, it goes on: no factor is proved twice."""
     monkeypatch.setattr(proofs, "PRECISE", 1.4)
