@@ -34,7 +34,9 @@ def proved_factor(
     make_folder(place / "certificates")
     make_folder(run / tried)
     best = place / "certificates" / f"{name}.json"
-    journal = Journal(place / f".{name}.proofs.jsonl", {"elite": elite_digests(run, name), "box": box.model_dump()})
+    journal = Journal(
+        place / f".{name}.proofs.jsonl", {"elite": elite_digests(run, name), "box": box.model_dump(mode="json")}
+    )
     if not journal.lines:
         best.unlink(missing_ok=True)
     known = {line["factor"]: line["volumes"] for line in journal.lines}
