@@ -72,7 +72,9 @@ class Console:
     """Where a verb speaks: stdout, a stream or a rich terminal. A context manager: leaving it ends the live line."""
 
     def __init__(self, stream: TextIO | None = None, terminal: Terminal | None = None):
-        self._terminal = terminal or Terminal(file=stream or sys.stdout)
+        stream = stream or sys.stdout
+        # Whatever FORCE_COLOR says, as in a notebook's shell: a live line in a pipe is unreadable.
+        self._terminal = terminal or Terminal(file=stream, force_terminal=_is_terminal(stream))
         self._bar: Bar | None = None
         self.spoken = time.monotonic()
         """When it said something last."""
@@ -123,6 +125,13 @@ class Console:
         finally:
             over.set()
             teller.join()
+
+
+def _is_terminal(stream: TextIO | None) -> bool:
+    try:
+        return stream is not None and stream.isatty()
+    except ValueError:  # it is closed
+        return False
 
 
 def each_second(console: Console) -> Callable[[int, int, str], None]:

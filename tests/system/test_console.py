@@ -8,7 +8,7 @@ import pytest
 
 from rtcd_jax.system import console as consoles
 from rtcd_jax.system.console import Clock, Console, Progress, duration, table, times
-from tests.consoles import Screen
+from tests.consoles import Output, Screen
 
 
 def test_plain_lines_into_a_file():
@@ -101,3 +101,13 @@ def test_what_takes_long_says_so_again_and_again_until_it_is_over():
     seen.clear()
     assert not seen.wait(0.1)
     assert stream.text.count("\n") == lines
+
+
+def test_a_pipe_gets_lines_whatever_the_environment_forces(monkeypatch):
+    """A notebook sets FORCE_COLOR for all that it starts."""
+    monkeypatch.setenv("FORCE_COLOR", "1")
+    output = Output()
+    with output.console as console:
+        console.progress(Progress(1, 2, "half"))
+        console.message("done")
+    assert output.lines == ["half", "done"]
