@@ -13,7 +13,7 @@ import sys
 import threading
 import time
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import BrokenExecutor
 from typing import NoReturn, Self
 
@@ -49,6 +49,24 @@ class Exit(enum.IntEnum):
     CUT_OFF = 141, "the output is closed"
 
 
+class Terminated(Exception):
+    """SIGTERM, between two steps that are kept."""
+
+
+@contextlib.contextmanager
+def heeding_sigterm() -> Iterator[None]:
+    """SIGTERM raises Terminated meanwhile: for work of which a journal keeps every finished part."""
+
+    def end(*_: object) -> NoReturn:
+        raise Terminated
+
+    before = signal.signal(signal.SIGTERM, end)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
+
+
 def explain(error: BaseException, debug: bool = False) -> Exit:
     """Says in one line on stderr what ended a command, with the traceback before it if asked to; the exit code."""
     if _interrupted.is_set():  # whatever a library has made of it
@@ -68,6 +86,9 @@ def explain(error: BaseException, debug: bool = False) -> Exit:
         case BrokenExecutor():
             say("rtcd: a worker process was ended from outside, for want of memory perhaps: try fewer")
             return Exit.LOST_PROCESS
+        case Terminated():
+            say("asked to stop (SIGTERM): what is finished is kept; the same command goes on")
+            return Exit.PREEMPTED
         case KeyboardInterrupt():
             _explained.set()
             say(STOPPED)

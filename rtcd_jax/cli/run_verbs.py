@@ -10,7 +10,7 @@ from typing import Annotated, Literal
 import tyro
 from pydantic import AfterValidator, Field
 
-from rtcd_jax.cli.exits import Exit
+from rtcd_jax.cli.exits import Exit, heeding_sigterm
 from rtcd_jax.cli.options import Cache, Elite, ExistingRun, Options, Positional, Run, shown
 from rtcd_jax.config.schema import REFINABLE, REFINEMENT_STEPS
 from rtcd_jax.config.settings import refusal
@@ -296,6 +296,9 @@ class CertifyOptions(Options):
 
     run: Run = Field(description="the run folder")
     elites: int = Field(default=1, description="how many, the best first [-]", ge=1)
+    elite: Annotated[int | None, shown("NUMBER", "the best ones")] = Field(
+        default=None, description="only this one: a task of a job array, launch/slurm/certify.sbatch [-]", ge=0
+    )
     guarantee: Annotated[Literal["certified", "proved"], tyro.conf.arg(aliases=("--rung",))] = Field(
         default="proved", description="to be shown"
     )
@@ -311,9 +314,12 @@ class CertifyOptions(Options):
 
 def certify(options: CertifyOptions, console: Console) -> Exit:
     from rtcd_jax.certificate.prove.run import certify_run
+    from rtcd_jax.elite.records import elite_name
 
-    workers, more = options.workers or cores(), (options.optimize_value, options.uncertainty, options.solver)
-    return _verdict(certify_run(options.run, options.elites, options.guarantee, workers, console, *more))
+    workers, only = options.workers or cores(), None if options.elite is None else elite_name(options.elite)
+    how = options.optimize_value, options.uncertainty, options.solver, only
+    with heeding_sigterm():
+        return _verdict(certify_run(options.run, options.elites, options.guarantee, workers, console, *how))
 
 
 def _certificate(path: Path) -> Path:

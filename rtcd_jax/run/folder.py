@@ -10,11 +10,9 @@ JAX are imported where states are kept.
 """
 
 import contextlib
-import fcntl
 import itertools
 import json
 import os
-import socket
 import time
 from collections.abc import Iterable, Iterator
 from functools import partial
@@ -37,6 +35,7 @@ from rtcd_jax.elite.records import (
 )
 from rtcd_jax.system.errors import UserError
 from rtcd_jax.system.files import (
+    held,
     make_folder,
     plain,
     read_json,
@@ -322,18 +321,7 @@ def _add_start(path: Path, config: Config) -> None:
 @contextlib.contextmanager
 def locked(path: Path) -> Iterator[None]:
     """Holds the folder for this process; the system frees it when the process ends, however it ends."""
-    with contextlib.ExitStack() as stack:
-        with writing(path):
-            file = stack.enter_context((path / _LOCK).open("a+"))
-            try:
-                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except BlockingIOError:
-                file.seek(0)
-                holder = file.read().strip() or "another process"
-                raise UserError(f"{path} is in use by {holder}: wait for it or choose another folder") from None
-            file.truncate(0)
-            file.write(f"process {os.getpid()} on {socket.gethostname()}\n")
-            file.flush()
+    with held(path / _LOCK, f"{path}", "wait for it or choose another folder"):
         yield
 
 

@@ -2,9 +2,11 @@
 
 import contextlib
 import errno
+import fcntl
 import json
 import math
 import os
+import socket
 import zipfile
 import zlib
 from collections.abc import Container, Iterator, Mapping
@@ -35,6 +37,61 @@ def user_cache() -> Path:
     """`rtcd_jax` in the user's folder for caches, `$XDG_CACHE_HOME` or ~/.cache."""
     given = Path(os.environ.get("XDG_CACHE_HOME", ""))
     return (given if given.is_absolute() else Path(os.path.expanduser("~/.cache"))) / "rtcd_jax"
+
+
+@contextlib.contextmanager
+def held(lock: Path, what: str, advice: str) -> Iterator[None]:
+    """Holds `what` by a lock file for this process; the system frees it when the process ends, however it ends.
+
+    Raises:
+        UserError: another process holds it, or there can be no such file.
+    """
+    with contextlib.ExitStack() as stack:
+        try:
+            file = _lock(stack, lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            holder = lock.read_text().strip() or "another process"
+            raise UserError(f"{what} is in use by {holder}: {advice}") from None
+        file.truncate(0)
+        file.write(f"process {os.getpid()} on {socket.gethostname()}\n")
+        file.flush()
+        yield
+
+
+@contextlib.contextmanager
+def in_turn(lock: Path) -> Iterator[None]:
+    """Waits until no other process is at this, and leaves no file."""
+    with contextlib.ExitStack() as stack:
+        _lock(stack, lock, fcntl.LOCK_EX)
+        with removed(lock):
+            yield
+
+
+@contextlib.contextmanager
+def removed(lock: Path) -> Iterator[None]:
+    """Removes a lock file that this process holds, at the end."""
+    try:
+        yield
+    finally:
+        lock.unlink(missing_ok=True)
+
+
+def _lock(stack: contextlib.ExitStack, lock: Path, how: int) -> Any:
+    """The locked file, open in the stack. Raises BlockingIOError where another process has it, and `how` says not to
+    wait.
+    """
+    while True:
+        with writing(lock):
+            file = stack.enter_context(lock.open("a+"))
+        try:
+            fcntl.flock(file, how)
+        except BlockingIOError:
+            raise
+        except OSError as error:
+            raise UserError(f"cannot lock {lock}: {error.strerror}") from error
+        with contextlib.suppress(FileNotFoundError):
+            if os.path.samestat(os.fstat(file.fileno()), lock.stat()):
+                return file  # and no file that its holder has just removed
 
 
 def make_folder(path: Path) -> None:

@@ -9,13 +9,15 @@ from rtcd_jax.certificate import check
 from rtcd_jax.certificate.prove import backward
 from rtcd_jax.certificate.prove import certify as elite
 from rtcd_jax.certificate.prove.closed_loop import Loop, claim_of
-from rtcd_jax.certificate.prove.run import certify_run, rank_correlation
+from rtcd_jax.certificate.prove.run import Pace, certify_run, rank_correlation
 from rtcd_jax.cli import main as cli
 from rtcd_jax.elite.elite import Elite
+from rtcd_jax.elite.records import write_elite
 from rtcd_jax.system.errors import UserError
 from tests.certificate import swing
 from tests.certificate.claims import claimed
 from tests.certificate.folder import folder_with
+from tests.certificate.test_check import resealed
 from tests.consoles import Screen
 
 
@@ -115,6 +117,104 @@ def test_another_solver_proves_the_funnel_too(tmp_path, content):
     assert other.volumes["sum"] == pytest.approx(check.check(content).volumes["sum"], rel=0.01)
 
 
+def refuse_to_prove(*_):
+    raise AssertionError("a finished proof is made again")
+
+
+def test_a_finished_proof_is_not_made_again(tmp_path, monkeypatch):
+    """The same file, and the table of it; another way, another claim or another file is proved."""
+    run, first, second = folder_of(tmp_path), Screen(), Screen()
+    assert certify_run(run, 1, "proved", 1, first.console)
+    file, summary = run / "certificates" / "000.json", run / "certificates" / "summary.json"
+    before = file.read_bytes(), summary.read_text()
+    with monkeypatch.context() as patch:
+        patch.setattr(elite, "goal_region", refuse_to_prove)
+        assert elite.certify_elite(run, "000", "proved", lambda step: None) is not None
+        for change in (
+            {"solver": "SCS"},
+            {"optimize_value": True},
+            {"guarantee": "certified"},
+            {"uncertainty": _file(tmp_path / "w.yaml", "input: 0.01")},
+        ):
+            how = {"guarantee": "proved", **change}
+            with pytest.raises(AssertionError, match="made again"):
+                elite.certify_elite(run, "000", on_step=lambda step: None, **how)
+    assert certify_run(run, 1, "proved", 1, second.console)
+    assert (file.read_bytes(), summary.read_text()) == before
+    assert "before" in second.text
+    assert "interval 1/4  back to" not in second.text
+    for damaged in (
+        before[0][:-100],
+        before[0].replace(b'"goal":{"axes"', b'"goal":{ "axes"', 1)[:-9],
+        _forged(before[0]),
+    ):
+        file.write_bytes(damaged)
+        monkeypatch.setattr(elite, "goal_region", refuse_to_prove)
+        with pytest.raises(AssertionError, match="made again"):
+            elite.certify_elite(run, "000", "proved", lambda step: None)
+
+
+def _file(path, text):
+    path.write_text(text)
+    return path
+
+
+def _forged(file):
+    """With another funnel, whole and under the same task: it proves nothing."""
+    content = json.loads(file)
+    content["funnel"][1]["cases"]["free"]["gram"][0][0] = (-1.0).hex()
+    return json.dumps(resealed(content)).encode()
+
+
+def test_an_elite_is_proved_by_one_process_at_a_time(tmp_path):
+    run = folder_of(tmp_path)
+    seen = []
+
+    def meanwhile(step):
+        if not seen:
+            seen.append(step)
+            with pytest.raises(UserError, match=r"elite 000 of .* is in use by process \d+ on .*: it is being proved"):
+                elite.certify_elite(run, "000", "proved", meanwhile)
+
+    assert elite.certify_elite(run, "000", "proved", meanwhile) is not None
+    assert seen
+    assert not list((run / "certificates").glob(".*"))
+
+
+def test_summaries_of_several_processes_keep_each_other_s_elites(tmp_path):
+    run = folder_of(tmp_path)
+    arrays, record = swing.elite()
+    write_elite(run / "elites", "001", arrays, {"status": "OK", **record})
+    for name in ("001", "000"):
+        assert certify_run(run, 8, "certified", 1, Screen().console, only=name)
+    assert json.loads((run / "certificates" / "summary.json").read_text()).keys() == {"000", "001"}
+    with pytest.raises(UserError, match="has no elite 007; there are 000, 001"):
+        certify_run(run, 8, "certified", 1, Screen().console, only="007")
+
+
+def test_the_time_left_is_that_of_the_intervals_that_are_left():
+    """Whatever the goal's region took, and whatever was there from a former call."""
+    pace = Pace(["000"], 1)
+    assert np.isnan(pace.left)
+    pace.step("000", 0.1, 220.0)  # the region of the goal, and the first interval
+    assert np.isnan(pace.left)
+    pace.step("000", 0.2, 230.0)
+    assert pace.left == pytest.approx(80.0)
+    resumed = Pace(["000"], 1)
+    resumed.step("000", 0.9, 20.0)
+    resumed.step("000", 0.95, 25.0)
+    assert resumed.left == pytest.approx(5.0)
+    two = Pace(["000", "001", "002"], 2)
+    for share, now in ((0.1, 10.0), (0.6, 60.0)):
+        two.step("000", share, now)
+    two.step("001", 0.5, 60.0)
+    assert two.left == pytest.approx(100.0), "40, 50 and 100 s for two workers, but the last one has one"
+    assert two.done == pytest.approx(1.1)
+    two.finish("000")
+    two.finish("001")
+    assert two.left == pytest.approx(100.0)
+
+
 class Killed(Exception):
     pass
 
@@ -125,7 +225,7 @@ def test_a_killed_search_goes_on_to_the_same_certificate(tmp_path, optimized):
     elite.certify_elite(whole, "000", "proved", lambda step: None, optimized)
 
     def stop(step):
-        if step.knot == 2:
+        if isinstance(step, elite.Step) and step.knot == 2:
             raise Killed
 
     with pytest.raises(Killed):
@@ -134,8 +234,8 @@ def test_a_killed_search_goes_on_to_the_same_certificate(tmp_path, optimized):
     with journal.open("ab") as file:
         file.write(b'{"stretch": {"torn')
     seen = []
-    elite.certify_elite(killed, "000", "proved", lambda step: seen.append(step.knot), optimized)
-    assert seen == [1, 0]
+    elite.certify_elite(killed, "000", "proved", seen.append, optimized)
+    assert [step.knot for step in seen if isinstance(step, elite.Step)] == [1, 0]
     assert (killed / "certificates" / "000.json").read_bytes() == (whole / "certificates" / "000.json").read_bytes()
 
 

@@ -1,5 +1,6 @@
 """The launch scripts on a real Slurm: preempted, requeued, resumed, and the same result as without all that."""
 
+import json
 import os
 import re
 import subprocess
@@ -9,6 +10,10 @@ from pathlib import Path
 
 import pytest
 
+from rtcd_jax.certificate import check
+from rtcd_jax.elite.records import write_elite
+from tests.certificate import swing
+from tests.certificate.folder import folder_with
 from tests.paths import ROOT
 from tests.run import slurm
 from tests.run.test_folder import driver, end, results
@@ -100,6 +105,50 @@ def test_every_script_hands_its_arguments_to_rtcd(cluster, tmp_path):
     )  # fmt: skip
     assert cluster.ended(f"{number}_3")["JobState"] == "COMPLETED", output.read_text()
     assert output.read_text().splitlines()[-1] == "called: sweep configs/sweep.yaml --case 3"
+    number = cluster.call(
+        "sbatch", *small, "--array=2", "--parsable", f"--chdir={ROOT}", f"--output={output}",
+        "launch/slurm/certify.sbatch", "checkpoints/x", "--optimize_value", RTCD=str(rtcd),
+    )  # fmt: skip
+    assert cluster.ended(f"{number}_2")["JobState"] == "COMPLETED", output.read_text()
+    called = "called: certify checkpoints/x --optimize_value --elite 2 --workers 1"
+    assert output.read_text().splitlines()[-1] == called
+
+
+@pytest.mark.slow
+def test_proofs_over_an_array_are_stopped_and_go_on(cluster, tmp_path):
+    """Two elites, a task each, on one run folder; the system stops both once, in their proofs' first intervals."""
+    run, elites = tmp_path / "run", 2
+    arrays, record = swing.elite()
+    folder_with(run, arrays, record)
+    write_elite(run / "elites", "001", {**arrays, "rho": arrays["rho"] / 2}, {"status": "OK", **record})
+    rtcd = tmp_path / "rtcd"
+    rtcd.write_text(f'#!/bin/sh\nexec "{sys.executable}" -u -m rtcd_jax "$@"\n')
+    rtcd.chmod(0o755)
+    number = cluster.call(
+        "sbatch", "--array=0-1", "--parsable", "--time=10", "--oversubscribe", f"--chdir={ROOT}", "--partition=low",
+        f"--output={tmp_path}/%a.out", "launch/slurm/certify.sbatch", run, RTCD=str(rtcd), PYTHONPATH=str(ROOT),
+    )  # fmt: skip
+    journals = [run / "certificates" / f".00{k}.partial.jsonl" for k in range(elites)]
+    begun = time.monotonic()
+    while not any(journal.exists() and b'"stretch"' in journal.read_bytes() for journal in journals):
+        assert time.monotonic() - begun < 300, [path.read_text() for path in tmp_path.glob("*.out")]
+        time.sleep(0.05)
+    cluster.call("scancel", "--signal=TERM", number)
+    jobs = [cluster.ended(f"{number}_{k}", seconds=300) for k in range(elites)]
+    outputs = [(tmp_path / f"{k}.out").read_text() for k in range(elites)]
+    assert [job["JobState"] for job in jobs] == ["COMPLETED"] * elites, (jobs, outputs)
+    assert "1" in {job["Restarts"] for job in jobs}, outputs
+    assert "asked to stop (SIGTERM): what is finished is kept" in "".join(outputs)
+    for k in range(elites):
+        check.check_file(run / "certificates" / f"00{k}.json")
+    summary = json.loads((run / "certificates" / "summary.json").read_text())
+    assert summary.keys() == {"000", "001"}
+    written = [(run / "certificates" / f"00{k}.json").read_bytes() for k in range(elites)]
+    done = subprocess.run([rtcd, "certify", run, "--elites", "2"], capture_output=True, text=True, cwd=ROOT)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.count("before") == elites, done.stdout
+    assert [(run / "certificates" / f"00{k}.json").read_bytes() for k in range(elites)] == written
+    assert json.loads((run / "certificates" / "summary.json").read_text()) == summary
 
 
 def test_a_workstation_run_goes_on_in_the_background(tmp_path):

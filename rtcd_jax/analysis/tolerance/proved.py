@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from rtcd_jax.analysis.tolerance.factors import MOST, largest_factors
-from rtcd_jax.certificate.prove.certify import Step, certify_elite
+from rtcd_jax.certificate.prove.certify import Checking, Step, certify_elite
 from rtcd_jax.config.schema import UncertaintyConfig
 from rtcd_jax.elite.records import elite_digests
 from rtcd_jax.system.console import Clock, Console, Progress, duration
@@ -51,7 +51,9 @@ def proved_factor(
     def _volumes(factor: float) -> dict[str, float] | None:
         """None unless the funnel is proved from t = 0 on."""
 
-        def tell(step: Step) -> None:
+        def tell(step: Step | Checking) -> None:
+            if isinstance(step, Checking):
+                return
             text = f"factor {factor:.3g}: interval {step.knot + 1}/{step.knots}  elapsed {duration(clock.elapsed)}"
             console.progress(Progress(step.knots - step.knot, step.knots, text))
 

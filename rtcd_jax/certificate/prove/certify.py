@@ -1,7 +1,9 @@
 """One elite's certificate: goal region, then funnel. A journal keeps every step, so that a killed proof goes on."""
 
+import contextlib
 import hashlib
 import json
+import math
 import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -20,31 +22,45 @@ from rtcd_jax.certificate.prove.levels import leveled, unit_directions
 from rtcd_jax.certificate.prove.margins import feedback_delay, push_margin
 from rtcd_jax.certificate.prove.sdp import SOLVER
 from rtcd_jax.certificate.prove.uncertainty import bounds_of, uncertainty_of
-from rtcd_jax.certificate.standing import accepted, remember
+from rtcd_jax.certificate.standing import accepted, remember, standing_of
 from rtcd_jax.config.schema import UncertaintyConfig
 from rtcd_jax.elite.elite import Elite
-from rtcd_jax.system.files import replace
+from rtcd_jax.system.files import held, removed, replace
 from rtcd_jax.system.journal import Journal
 
+TASK = "task"
+"""Note of a certificate: the digest of what was to be proved, and how."""
 COARSER = 2
 """Stride of the directions for funnels that are not proved yet."""
 
 
 class Step(NamedTuple):
-    """How far an elite's certificate is: the interval and time [s] reached, rho there, its margin [1/s]."""
+    """How far an elite's certificate is: the interval, the fraction of it and the time [s] reached, rho there, its
+    margin [1/s].
+    """
 
     elite: str
     knot: int
+    fraction: float
     knots: int
     time: float
     rho: float
     margin: float
 
 
+class Checking(NamedTuple):
+    """How many intervals of an elite's finished certificate the checker has accepted."""
+
+    elite: str
+    done: int
+    of: int
+
+
 class Outcome(NamedTuple):
     """A finished certificate beside what was sampled; volumes over the knots from `start` [s] on.
 
     `volumes` are the certificate's. `beside` is the guarantee of the `sampled` ones: another for an external elite.
+    `seconds` is NaN for a certificate that was there already.
     """
 
     elite: str
@@ -66,7 +82,7 @@ def certify_elite(
     run: Path,
     name: str,
     guarantee: str,
-    on_step: Callable[[Step], None],
+    on_step: Callable[[Step | Checking], None],
     optimize_value: bool = False,
     uncertainty: Path | UncertaintyConfig | None = None,
     solver: str = SOLVER,
@@ -75,11 +91,29 @@ def certify_elite(
     """Writes NAME.json into a run's folder `target`; None if not even a goal region can be shown.
 
     `optimize_value` chooses the ellipsoids' shapes so that the funnel is large. The certificate bears what the run
-    bore, or another `uncertainty`, or that of a file. `solver` is by cvxpy's name.
+    bore, or another `uncertainty`, or that of a file. `solver` is by cvxpy's name. A certificate that is there already,
+    of the same claim in the same way, is not made again.
 
     Raises:
-        UserError: an elite that is not there, or of a plant that the checker does not know.
+        UserError: an elite that is not there, or of a plant that the checker does not know, or that another process is
+            proving.
     """
+    lock = run / target / f".{name}.lock"
+    with held(lock, f"elite {name} of {run}", "it is being proved there"), removed(lock):
+        return _certified(run, name, guarantee, on_step, optimize_value, uncertainty, solver, target)
+
+
+def _certified(
+    run: Path,
+    name: str,
+    guarantee: str,
+    on_step: Callable[[Step | Checking], None],
+    optimize_value: bool,
+    uncertainty: Path | UncertaintyConfig | None,
+    solver: str,
+    target: str,
+) -> Outcome | None:
+    """`certify_elite` of an elite that no other process is at."""
     began = time.perf_counter()
     elite = Elite.read(run, name)
     bounds, folder = bounds_of(elite, uncertainty_of(elite, uncertainty)), run / target
@@ -89,12 +123,16 @@ def certify_elite(
         delay = feedback_delay(_read(loop_record, elite), elite)
         loop_record |= delay.record()
         misfits = delay.misfits, delay.misfit_at_goal
+    head = {"claim": check.digest(loop_record), "rung": guarantee, "optimize_value": optimize_value, "solver": solver}
+
+    def checking(done: int, of: int) -> None:
+        on_step(Checking(name, done, of))
+
+    if (content := _finished(folder / f"{name}.json", head, elite, checking)) is not None:
+        return _outcome(name, content, elite, guarantee, math.nan)
     claim = _read(loop_record, elite)
     loop, exact = Loop(claim, elite, *misfits), guarantee == "proved"
-    journal = Journal(
-        folder / f".{name}.partial.jsonl",
-        {"claim": check.digest(loop_record), "rung": guarantee, "optimize_value": optimize_value, "solver": solver},
-    )
+    journal = Journal(folder / f".{name}.partial.jsonl", head)
     if optimize_value:
         loop = _shaped(loop, journal)
     region = _region(claim, loop, exact, bounds.rest, journal, solver)
@@ -114,7 +152,7 @@ def certify_elite(
             }
         )
         at = (interval.knot + float(interval.start)) * loop.dt
-        on_step(Step(name, interval.knot, len(loop.u), at, proved.rho, proved.margin))
+        on_step(Step(name, interval.knot, float(interval.start), len(loop.u), at, proved.rho, proved.margin))
     seconds = time.perf_counter() - began
     intervals = [line["stretch"] for line in journal.lines if "stretch" in line][::-1]
     if not intervals:
@@ -127,22 +165,39 @@ def certify_elite(
         "claim": with_digests({**loop_record, "start": start, "push": double(push)}),
         "funnel": intervals,
         "goal": goal,
-        "notes": {"elite": name, "rung at writing": guarantee, "solver": solver},
+        "notes": {"elite": name, "rung at writing": guarantee, "solver": solver, TASK: check.digest(head)},
     }
-    outcome = _finish(folder / f"{name}.json", with_digests(content), elite, guarantee, seconds, journal)
-    return outcome._replace(beside=elite.guarantee)
+    content = with_digests(content)
+    _write(folder / f"{name}.json", content, guarantee, checking)
+    journal.close()
+    return _outcome(name, content, elite, guarantee, seconds)
 
 
-def _finish(
-    path: Path, content: dict[str, Any], elite: Elite, guarantee: str, seconds: float, journal: Journal
-) -> Outcome:
+def _write(path: Path, content: dict[str, Any], guarantee: str, progress: Callable[[int, int], None]) -> None:
     """Writes the certificate; one that says *proved* after the checker has accepted the whole file."""
     file = (json.dumps(content, separators=(",", ":")) + "\n").encode()
     if guarantee == "proved":
         digest = hashlib.sha256(file).hexdigest()
-        remember(digest, accepted(check.check(check.parse(file)), digest))
+        remember(digest, accepted(check.check(check.parse(file), progress), digest))
     replace(path, file)
-    journal.close()
+
+
+def _finished(
+    path: Path, head: Mapping[str, Any], elite: Elite, progress: Callable[[int, int], None]
+) -> dict[str, Any] | None:
+    """The certificate that is there, if it is of this task, whole, and as good as it says; None if it is to be made."""
+    with contextlib.suppress(OSError, ValueError, TypeError, KeyError, AttributeError, RecursionError, Refused):
+        content = check.parse(path.read_bytes())
+        claim = {key: value for key, value in content["claim"].items() if key not in ("start", "push", "sha256")}
+        whole = with_digests({key: value for key, value in content.items() if key != "sha256"}) == content
+        ours = content["notes"].get(TASK) == check.digest(head) and check.digest(claim) == head["claim"]
+        if whole and ours and (head["rung"] != "proved" or standing_of(path, elite, progress).proved):
+            return content
+    return None
+
+
+def _outcome(name: str, content: Mapping[str, Any], elite: Elite, guarantee: str, seconds: float) -> Outcome:
+    """A certificate beside what was sampled."""
     claim = check.read_claim(Node("claim", content["claim"]))
     intervals = [check.read_interval(Node("funnel", each), claim) for each in content["funnel"]]
     axes = Node("goal.axes", content["goal"]["axes"]).array(claim.n, claim.n)
@@ -155,7 +210,7 @@ def _finish(
         "integral": float(np.trapezoid(per_knot, dx=step)),
         "goal": float(per_knot[-1]),
     }
-    return Outcome(path.stem, guarantee, start * step, len(intervals), seconds, sampled, volumes)
+    return Outcome(name, guarantee, start * step, len(intervals), seconds, sampled, volumes, elite.guarantee)
 
 
 def _read(loop_record: Mapping[str, Any], elite: Elite) -> Claim:
