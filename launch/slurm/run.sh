@@ -36,7 +36,7 @@ if [[ $code == 85 || $code == 75 ]]; then
     job=${job:-$SLURM_JOB_ID}
     state=$(scontrol show job --oneliner "$job" | sed -n 's/.* JobState=\([A-Z]*\).*/\1/p')
     if [[ $state == RUNNING ]]; then
-      scontrol requeue "$job"
+      scontrol requeue "$job" && sleep 60   # until Slurm ends this script: one that exits before it may count as failed
     else
       echo "job $job is $state: not requeued"
     fi
