@@ -63,13 +63,8 @@ class Problem:
     def intervals(self) -> int:
         return self.config.trajectory.knots - 1
 
-    @property
-    def designs_motors(self) -> bool:
-        """Whether a motor's limit depends on the design."""
-        return isinstance(self.input_limits(initial_design(self)), jax.Array)
-
     def input_limits(self, design: eqx.Module) -> Float[Array | np.ndarray, "m *batch"]:
-        """Largest |u_i| of every input; a constant of the program if it does not depend on the design."""
+        """Largest |u_i| of every input; numpy's, a constant of the program, if it does not depend on the design."""
         limits = self.plant.input_limits(design)
         if all(isinstance(limit, int | float) for limit in limits):
             return np.array(limits, float)

@@ -105,9 +105,10 @@ def _inputs(problem: Problem, candidate: Candidate, us: Array | Components) -> A
     Its box is one for all candidates: where a motor's limit is a design, its inputs are those of the initial design's
     motor, of which the candidate's gives the same share.
     """
-    if not problem.designs_motors:
+    limits = problem.input_limits(candidate.design)
+    if isinstance(limits, np.ndarray):
         return us
-    limits, known = problem.input_limits(candidate.design), problem.input_limits(initial_design(problem))
+    known = problem.input_limits(initial_design(problem))
     given = tuple(limit / first * u for limit, first, u in zip(limits, known, us, strict=True))
     return given if isinstance(us, tuple) else jnp.stack(given)
 

@@ -47,7 +47,7 @@ def printable(text: object, longest: int = 400) -> str:
     return shown if len(shown) <= longest and len(str(text)) <= longest else f"{shown[: longest - 3]}..."
 
 
-def exact(double: float):
+def rational(double: float):
     """The number that a double is; OverflowError where it is none."""
     return Q(*double.as_integer_ratio())
 

@@ -17,7 +17,7 @@ from rtcd_jax.certificate.check.exact import (
     Q,
     Refused,
     Undecided,
-    exact,
+    rational,
     require,
     rounded,
 )
@@ -85,7 +85,7 @@ class Node(NamedTuple):
             isinstance(self.value, str) and bool(_DOUBLE.fullmatch(self.value)), "must be a double in hexadecimal"
         )
         try:
-            return exact(float.fromhex(self.value))
+            return rational(float.fromhex(self.value))
         except OverflowError:
             raise Refused(self.place, "is too large for a double") from None
 

@@ -126,7 +126,7 @@ class BackwardProof:
         chord = (b - a) / 2
         at_start, at_end = (a_rate * half - chord) / 2, (chord - b_rate * half) / 2
         bend = [on_grid((at_end + at_start) / 2), on_grid((at_end - at_start) / 2)]
-        fractions = check.exact(start), check.exact(end)
+        fractions = check.rational(start), check.rational(end)
         order = TIERS[self.claim.n][0][0]
         late = loop.late_rows(k, start, end) if self.claim.first_order else []
         return Interval(k, *fractions, on_grid(a), state.axes, bend, (TIME_ORDER, order), {}, late), rho

@@ -219,10 +219,10 @@ class Loop:
         late_at_goal = check.error_under(claim, [claim.K_goal])
         if claim.first_order:
             late = [
-                check.lateness(claim, error, check.exact(misfit), check.jumps_within_reach(claim, k, 0))
+                check.lateness(claim, error, check.rational(misfit), check.jumps_within_reach(claim, k, 0))
                 for k, (error, misfit) in enumerate(zip(late, misfits, strict=True))
             ]
-            late_at_goal = check.lateness(claim, late_at_goal, check.exact(misfit_at_goal), check.Q(0))
+            late_at_goal = check.lateness(claim, late_at_goal, check.rational(misfit_at_goal), check.Q(0))
         self.late, self.late_at_goal = [float(each) for each in late], float(late_at_goal)
         self._points = ControlPoints.of(claim)
         self.x, self.rates, self.u = floats(claim.x), floats(claim.rates), floats(claim.u)

@@ -62,7 +62,7 @@ def _at_level(
         field = check.goal_field(claim, axes, order, "goal", late)
         while waiting:  # from the outside in
             start, end = waiting.pop()
-            ends = check.exact(start), check.exact(end)
+            ends = check.rational(start), check.rational(end)
             proof = None
             if start or not claim.moves_the_goal:
                 todo = check.goal_obligations(claim, field, *ends)

@@ -24,7 +24,7 @@ def push_margin(claim: Claim, intervals: Sequence[Interval]) -> float:
     box = check.cube(claim)
 
     def holds(push: float) -> bool:
-        return all(check.is_positive(clearance(check.exact(push)), box) for clearance in clearances)
+        return all(check.is_positive(clearance(check.rational(push)), box) for clearance in clearances)
 
     low, high = 0.0, 1.0
     while holds(high):
@@ -69,11 +69,11 @@ def feedback_delay(claim: Claim, elite: Elite) -> Delay:
     axes, order = on_grid(loop.axes(len(claim.u) - 1, 1.0, 1.0, 0.0)[0]), TIERS[claim.n][0][0]
     speeds = [check.funnel_speed(claim, interval, "speed") for interval in intervals]
     speed = SPEED_CLEARANCE * float(max(*speeds, check.goal_speed(claim, axes, order, "speed")))
-    claim = claim._replace(speed=check.exact(speed))
+    claim = claim._replace(speed=check.rational(speed))
     bounds = [check.funnel_delay(claim, interval, "delay") for interval in intervals]
     bounds.append(check.goal_delay(claim, axes, order, "delay", loop.goal_late_row()))
     jerk, reaction = (SPEED_CLEARANCE * float(max(each)) for each in list(zip(*bounds, strict=True))[:2])
-    claim = claim._replace(reaction=check.exact(reaction))
+    claim = claim._replace(reaction=check.rational(reaction))
     jumps = [0.0] + [SPEED_CLEARANCE * float(check.funnel_jump(claim, each, "jump")) for each in intervals[1:]]
     *misfits, at_goal = (float(each.misfit) for each in bounds)
     return Delay(speed, jerk, reaction, jumps, misfits, at_goal)

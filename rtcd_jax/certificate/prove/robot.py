@@ -252,9 +252,8 @@ def _described(
                 raise UserError(f"no certificate for a spring on the hinge {robot.joints[i].name}: it has no sine")
             for power, factor in ((2, 0.5), (1, -rest)):
                 joints = tuple(power * (j == i) for j in range(len(equations.angles)))
-                potential.append(
-                    check.Term(joints, term.powers, check.exact(float(term.cosine) * factor), check.exact(0.0))
-                )
+                cosine = check.rational(float(term.cosine) * factor)
+                potential.append(check.Term(joints, term.powers, cosine, check.Q(0)))
     states = robot.states
     return check.Robot(
         name=robot.name,
@@ -286,7 +285,7 @@ def _function(p: Laurent, angles: Sequence[bool], symbols: Sequence[Polynomial])
             entry[0], entry[1] = entry[0] + parts[0], entry[1] + parts[1]
             entry[2] = max(entry[2], *map(abs, parts))
     return tuple(
-        check.Term(places, powers, *(check.exact(part if abs(part) > ROUNDING * largest else 0.0) for part in parts))
+        check.Term(places, powers, *(check.rational(part if abs(part) > ROUNDING * largest else 0.0) for part in parts))
         for (places, powers), (*parts, largest) in sorted(total.items())
         if any(abs(part) > ROUNDING * largest for part in parts)
     )
