@@ -6,17 +6,21 @@ RECENT := import sys; sys.exit(sys.version_info < (3, 11))
 PYTHON ?= $(shell for python in python3 python3.14 python3.13 python3.12 python3.11; do \
 	$$python -c '$(RECENT)' 2>/dev/null && { echo $$python; break; }; done)
 
-.PHONY: run test lint docs gpu-budget clean
+.PHONY: run test test-thorough lint docs gpu-budget clean
 
 run: $(VENV)/installed
 	$(BIN)/rtcd optimize configs/pendulum_rtcd.yaml
 
 # The tests' programs are small and many: all are kept, and shared by the tests' processes.
-test: export JAX_COMPILATION_CACHE_DIR ?= $(CURDIR)/.jax_cache
-test: export JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS ?= 0
-test: export JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES ?= -1
+test test-thorough: export JAX_COMPILATION_CACHE_DIR ?= $(CURDIR)/.jax_cache
+test test-thorough: export JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS ?= 0
+test test-thorough: export JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES ?= -1
 test: $(VENV)/installed-dev
 	$(BIN)/python -m pytest -n 2 --dist loadfile
+
+# What takes a test more than some seconds: whole searches, processes that are killed, terminals, large compilations.
+test-thorough: $(VENV)/installed-dev
+	$(BIN)/python -m pytest -n 2 --dist loadfile -m 'thorough and not slow'
 
 lint: $(VENV)/installed-dev
 	$(BIN)/ruff check

@@ -63,6 +63,7 @@ def scalar_funnel(cubic: float, may: Uncertainty):
     return estimate_funnel(problem, candidate, policy, jax.random.key(0), search_budget(problem))
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(("share", "status"), [(1.01, Status.OK), (0.99, Status.FUNNEL_EMPTY)])
 def test_a_disturbance_is_borne_by_what_is_just_large_enough(share, status):
     """x' = -x + w with |w| <= r / share stays in |x| <= r for a share above 1 alone."""
@@ -72,6 +73,7 @@ def test_a_disturbance_is_borne_by_what_is_just_large_enough(share, status):
         np.testing.assert_allclose(np.sqrt(funnel.levels), LIMIT, rtol=2 * MARGIN)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(("residual", "status"), [(0.5, Status.OK), (0.3, Status.FUNNEL_EMPTY)])
 def test_a_region_lies_between_the_roots(residual, status):
     """x' = -x + x^3 + w falls for all |w| <= 0.3 where r - r^3 > 0.3; what is inside the lower root stays there."""
@@ -158,6 +160,7 @@ def drawn(may: Uncertainty, samples: int) -> Drawn:
     return Drawn.of(robot()[0], may, jax.random.key(0), samples)._replace(motion=None)
 
 
+@pytest.mark.thorough
 def test_no_width_is_the_nominal_loop():
     (plant, design), at = robot(), situation(100)
     u = jnp.clip(at.asked, -at.bounds, at.bounds)
@@ -168,6 +171,7 @@ def test_no_width_is_the_nominal_loop():
         np.testing.assert_allclose(rate, nominal, rtol=1e-14, atol=1e-14)  # sums of terms of up to 10
 
 
+@pytest.mark.thorough
 def test_drawn_robots_move_by_mjx_as_by_their_equations():
     """Each by edits of its own of the MJCF; 1 % off, they do not."""
     robots, at, (_, design) = drawn(BOX, 30), situation(30), robot()
@@ -194,6 +198,7 @@ def estimator():
     return estimate, one
 
 
+@pytest.mark.thorough
 def test_a_larger_box_never_has_a_larger_level():
     """Zero widths have the nominal levels, the last box none at all."""
     estimate, nominal = estimator()
@@ -206,6 +211,7 @@ def test_a_larger_box_never_has_a_larger_level():
     assert 0 < funnels[4].borne < 1
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(("factor", "bears"), [(1.0, True), (2.0, False)])
 def test_robots_of_the_box_stay_and_others_are_found_out(factor, bears):
     """A few hundred held-out samples a knot, each another robot with another disturbance."""

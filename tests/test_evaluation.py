@@ -65,6 +65,7 @@ def test_the_same_key_gives_the_same_result_and_another_one_other_samples():
     np.testing.assert_allclose(other.volumes["sum"][fine], again.volumes["sum"][fine], rtol=0.03)
 
 
+@pytest.mark.thorough
 def test_neighbors_do_not_matter():
     """In another order, and beside a genome of NaN, every other candidate is what it was, bit by bit."""
     order = np.array([3, 1, 4, 0, 2])
@@ -84,6 +85,7 @@ def test_batches_in_any_order_give_the_candidates_in_theirs(batch):
     np.testing.assert_array_equal(seen, np.cumsum(x, 1))
 
 
+@pytest.mark.thorough
 def test_a_search_for_the_goal_s_region_needs_no_motion():
     """The region is that at the end of a swing-up, but for what held-out samples took of it, followed to the goal."""
     config = pipeline.problem().config

@@ -95,6 +95,7 @@ def _boxed():
     return _estimator(linear.problem_of(BOX), rounds=3, samples_per_knot=64)
 
 
+@pytest.mark.thorough
 def test_without_saturation_only_the_boxes_limit_a_resting_funnel():
     """V falls from every state, so that each ellipsoid fills the boxes, and held-out samples find nothing to shrink."""
     funnel = _boxed()(RESTING)
@@ -122,6 +123,7 @@ def _scanned(policy, last: float, directions: int):
     return np.asarray(scan(policy))
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("directions", [1, 48])
 def test_the_scan_is_the_recursion_over_the_knots(directions):
     """rho_k = (1 - margin) rho_{k+1} / g_k, with the largest V_{k+1} = g_k V_k, over three orders up and down.
@@ -136,6 +138,7 @@ def test_the_scan_is_the_recursion_over_the_knots(directions):
     np.testing.assert_allclose(levels[:-1] * gains / levels[1:], 1 - MARGIN, rtol=1e-4)
 
 
+@pytest.mark.thorough
 def test_a_level_grows_as_far_as_the_ladder_reaches():
     """However much of V is lost over an interval: at least threefold, never beyond what is true."""
     scales = np.append(np.full(10, 1e3), 1.0)
@@ -155,6 +158,7 @@ def _moving(seed: int):
     return levels[:-1], exact[:-1], np.isclose(exact[:-1], boxed, rtol=1e-9)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (5, 6))])
 def test_a_moving_funnel_is_that_of_linear_algebra(seed):
     """Some levels end at a box at their knot, some at a box behind it, some at the next level."""
@@ -184,6 +188,7 @@ def _value(x):
     return np.sum(x * np.tensordot(linear.S, x, 1), 0)
 
 
+@pytest.mark.thorough
 def test_a_saturated_funnel_is_that_of_a_dense_grid():
     """Each level is the lowest V of a state of the grid that fails; the goal's is finite though no box is near."""
     limit, far = 1.0, 40.0
@@ -216,6 +221,7 @@ def _cheap(r: float, dt: float):
     return _with(linear.policy(np.zeros(4), dt), gains=gains, values=values)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(("r", "dt"), [(1e-4, 0.1), (1e-5, 0.01), (1e-6, 0.01)])
 def test_a_stiff_linear_loop_has_its_whole_funnel(r, dt):
     """V falls from every state, so that each ellipsoid fills the boxes, though 0.02 s are 2 to 20 time constants."""
@@ -226,6 +232,7 @@ def test_a_stiff_linear_loop_has_its_whole_funnel(r, dt):
     assert np.all(funnel.trials == 64)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(("r", "dt"), [(1e-5, 0.1), (1e-7, 0.01), (1e-8, 1e-4), (1e-12, 1e-6), (1e-12, 1.0)])
 def test_a_loop_too_stiff_for_its_rollouts_is_not_called_empty(r, dt):
     """Time constants that an eighth of an interval, a sixteenth of 0.02 s, or both have too many of."""
@@ -251,6 +258,7 @@ class Cubic(linear.Equations):
         return 0.5 * x[0] ** 2
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(("radius", "status"), [(0.5, Status.OK), (0.01, Status.OK), (5e-4, Status.FUNNEL_EMPTY)])
 def test_a_region_far_smaller_than_the_box_is_found(radius, status):
     """The box is that of 1000 times the radius 1 at which the input saturates; a thousandth of that counts as empty."""
@@ -267,6 +275,7 @@ def test_a_region_far_smaller_than_the_box_is_found(radius, status):
         np.testing.assert_allclose(np.sqrt(funnel.levels), radius, rtol=0.03)
 
 
+@pytest.mark.thorough
 def test_a_motion_that_leaves_the_boxes_has_an_empty_funnel():
     policy = linear.policy(3 * np.sin(np.arange(10.0)), 0.1)
     policy = eqx.tree_at(lambda p: p.trajectory.xs, policy, policy.trajectory.xs.at[0, 0].set(1.01 * BOX[0]))
@@ -291,6 +300,7 @@ def _saturating(*box):
     return _estimator(linear.problem_of(box, limit=1.0))(RESTING)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     "limits",
     [(np.inf, np.inf), (1e6, 1e6), *(pytest.param(box, marks=pytest.mark.slow) for box in ((np.inf, 20), (1e4, 1e4)))],
@@ -371,6 +381,7 @@ def test_the_elites_levels_are_resolved():
     np.testing.assert_allclose(elites[0], _generations()[0], rtol=0.01)
 
 
+@pytest.mark.thorough
 def test_a_pendulum_that_steers_too_hard_has_an_empty_funnel():
     """r = 0.002 asks for gains that the torque limit cannot serve."""
     assert pipeline.evaluated().status[pipeline.HARD] == Status.FUNNEL_EMPTY

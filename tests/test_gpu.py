@@ -50,6 +50,7 @@ def problem(request):
     return make_problem(configuration.parse(data))
 
 
+@pytest.mark.thorough
 def test_a_generation_and_an_elite_ask_nothing_of_the_host(problem):
     genomes, key = jnp.zeros((16, len(problem.free))), jax.random.key_data(jax.random.key(0))
     wrapped = jax.random.wrap_key_data
@@ -63,6 +64,7 @@ def test_a_generation_and_an_elite_ask_nothing_of_the_host(problem):
     assert calls(lowered(lambda evaluation, key: again(evaluation, wrapped(key)), one, key)) == set()
 
 
+@pytest.mark.thorough
 def test_the_search_asks_and_tells_on_the_device():
     strategy = cmaes.Strategy(5, 128, 0.3)
     state = jax.eval_shape(partial(cmaes.start, strategy), np.full(5, 0.5))
@@ -72,6 +74,7 @@ def test_the_search_asks_and_tells_on_the_device():
     assert calls(ask) | calls(tell) == set()
 
 
+@pytest.mark.thorough
 def test_disturbed_motions_ask_nothing_of_the_host(robots):
     lanes = scenarios.undisturbed(robots.plant, robots.design, np.zeros(64, int), np.zeros((robots.plant.n, 64)))
     motion = scenarios.start(robots.loops, lanes)

@@ -75,10 +75,12 @@ class Linearized:
         return np.stack([x[:, 1], torque / self.inertia], 1)
 
 
+@pytest.mark.thorough
 def test_every_candidate_has_a_policy(policies):
     np.testing.assert_array_equal(policies.status, Status.OK)
 
 
+@pytest.mark.thorough
 def test_values_are_symmetric_positive_definite_at_every_knot(policies):
     """The stiff candidate as well: its closed loop has poles that no explicit step of this size survives."""
     values = np.asarray(policies.values)
@@ -132,6 +134,7 @@ def test_values_solve_the_riccati_equation_along_the_motion(problem, planned, po
     assert np.max(errors(policies.values[row], exact)) < tolerance
 
 
+@pytest.mark.thorough
 def test_the_error_of_the_values_falls_with_the_square_of_the_substep(problem, candidates, planned, policies):
     config = problem.config
     finer = config.trajectory.model_copy(update={"substeps": 2 * config.trajectory.substeps})
@@ -142,6 +145,7 @@ def test_the_error_of_the_values_falls_with_the_square_of_the_substep(problem, c
     assert ratio == pytest.approx(4, rel=0.1)
 
 
+@pytest.mark.thorough
 def test_the_linearization_is_the_one_by_hand(problem, candidates):
     x = jnp.asarray(np.random.default_rng(0).normal(size=(2, 5)))
     u = jnp.zeros((1, 5))
@@ -153,6 +157,7 @@ def test_the_linearization_is_the_one_by_hand(problem, candidates):
             np.testing.assert_allclose(b[..., k], model.b, rtol=1e-12)
 
 
+@pytest.mark.thorough
 def test_the_nominal_motion_meets_knots_and_nearly_solves_the_dynamics(problem, candidates, planned):
     """Between the knots the interpolant's error is of fourth order in dt."""
     candidate, trajectory = take(candidates, 0), take(planned, 0)
@@ -169,6 +174,7 @@ def test_the_nominal_motion_meets_knots_and_nearly_solves_the_dynamics(problem, 
     np.testing.assert_allclose(at[:, 20, 1], half, atol=1e-3)
 
 
+@pytest.mark.thorough
 def test_vmapped_is_one_by_one(problem, candidates, planned, policies):
     alone = jax.jit(partial(stabilize, problem))
     for row in range(len(MASS)):
@@ -193,6 +199,7 @@ class Unactuated(type(packaged("pendulum"))):
         return super().dynamics(design, x, 0 * u)
 
 
+@pytest.mark.thorough
 def test_what_cannot_be_stabilized_is_indefinite(problem, candidates, planned):
     loose = dataclasses.replace(problem, plant=Unactuated(*jax.tree.leaves(problem.plant)))
     policy = jax.jit(partial(stabilize, loose))(take(candidates, 0), take(planned, 0))
@@ -229,6 +236,7 @@ def test_the_defaults_are_the_paper_s(problem):
     assert problem.config.policy.model_dump() == {"input_weight": 1.0, "authority": 1.0, "discount": 0.0}
 
 
+@pytest.mark.thorough
 def test_options_solve_their_own_riccati_equation(problem, cautious, candidates, planned):
     """S' = -((A + aI)'S + S (A + aI) - S B R^-1 B'S + Q) at the middle of intervals, R that of the interval's input."""
     soft, trajectory = take(candidates, SOFT), take(planned, SOFT)
@@ -261,6 +269,7 @@ def test_options_solve_their_own_riccati_equation(problem, cautious, candidates,
         np.testing.assert_allclose(policy.gains[k], np.asarray(b).T @ s[k] / weights[k], rtol=1e-9)
 
 
+@pytest.mark.thorough
 def test_a_candidate_s_own_options_go_before_the_configuration_s(problem, cautious, candidates, planned):
     """Searched or fixed, the same numbers are the same controller; others are another."""
     soft, trajectory = take(candidates, SOFT), take(planned, SOFT)
@@ -276,6 +285,7 @@ def test_a_candidate_s_own_options_go_before_the_configuration_s(problem, cautio
     assert not np.allclose(jax.jit(partial(stabilize, searched))(other, trajectory).gains, fixed.gains, rtol=1e-2)
 
 
+@pytest.mark.thorough
 def test_the_goal_s_lqr_is_discounted_too(problem, cautious, candidates):
     soft = take(candidates, SOFT)
     a, b = (np.asarray(m) for m in linearize(problem, soft, jnp.asarray(problem.goal), jnp.zeros(1)))

@@ -74,6 +74,7 @@ def at_rest() -> tuple[Candidate, Policy]:
     return Candidate(Nothing(), jnp.ones(1), jnp.ones(1)), policy
 
 
+@pytest.mark.thorough
 def test_a_refinement_ends_at_the_largest_region_that_there_is():
     """V falls by 2 (1 - r^2) - 2 |w| / r, and no shape changes that: the length of {V <= rho} is that of the region."""
     roots = np.roots([1, 0, -1 + DECAY_MARGIN / 2, PUSH])
@@ -84,6 +85,7 @@ def test_a_refinement_ends_at_the_largest_region_that_there_is():
     np.testing.assert_allclose(np.exp(by_levels), largest, rtol=AGREEMENT)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(("free", "stays"), [(("gains",), "values"), (("shapes",), "gains")])
 def test_what_is_not_free_stays(free, stays):
     (refinement, jitted), (candidate, policy) = scalar(), at_rest()
@@ -147,6 +149,7 @@ def test_more_uncertainty_leaves_smaller_levels():
     assert larger[0] < by_march[0] - 0.1
 
 
+@pytest.mark.thorough
 def test_the_riccati_equation_s_rates_are_those_that_stored_elites_have():
     """JAX's and numpy's, of the same policy."""
     known, evaluation = pipeline.problem(), rtcd()

@@ -105,6 +105,7 @@ def _limited(*limits: float):
     return dataclasses.replace(PROBLEM, state_limits=np.array(limits))
 
 
+@pytest.mark.thorough
 def test_an_interval_is_that_of_its_definition_to_fourth_order():
     """Away from the torque limit each halving of the step divides the error by 2^4, on every interval."""
     policy = _policy()
@@ -218,6 +219,7 @@ def test_limits_are_watched_on_the_way_to_the_goal(share):
     assert (reached.item() <= 1) == (share > 1)
 
 
+@pytest.mark.thorough
 def test_the_peak_is_the_largest_share_of_any_limit():
     """On either side of zero; a component without a limit has none."""
     policy = _policy()
@@ -288,6 +290,7 @@ def test_a_looped_step_is_the_unrolled_one():
     np.testing.assert_allclose(looped, at_goal, rtol=1e-10, atol=1e-11)
 
 
+@pytest.mark.thorough
 def test_mjx_moves_as_the_closed_form():
     policy = _policy()
     x = _about(policy, WIDE)

@@ -30,6 +30,7 @@ def test_what_does_not_oscillate_swings_once():
     assert np.all(np.isfinite(starts(standing, jnp.float64).xs))
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("name", ["pendulum_rtcd", "cartpole_rtcd"])
 def test_guesses_join_the_ends_at_admissible_steps(name):
     problem = _problem(name)

@@ -75,6 +75,7 @@ def share_solved(trajectories):
     return np.mean(np.asarray(trajectories.status) == Status.OK)
 
 
+@pytest.mark.thorough
 def test_nearly_all_random_candidates_are_solved(planned):
     assert share_solved(planned) >= 0.99
 
@@ -84,6 +85,7 @@ def test_nearly_all_of_a_thousand_random_candidates_are_solved(optimize, draw):
     assert share_solved(optimize(draw(1024, seed=1))) >= 0.99
 
 
+@pytest.mark.thorough
 def test_intervals_solve_the_dynamics_to_integration_accuracy(problem, solved):
     """Against an integration ten times finer than the transcription's own."""
     candidates, trajectories = solved
@@ -148,6 +150,7 @@ def test_the_cost_is_the_transcriptions(problem, solved):
     np.testing.assert_allclose(trajectories.cost, expected, rtol=1e-12)
 
 
+@pytest.mark.thorough
 def test_a_candidate_does_not_notice_its_neighbours_while_lanes_are_refilled(optimize, candidates, planned):
     """70 solves on 32 lanes, in two orders, beside others and in another population: equal to the last bit."""
     rows = np.arange(70)
@@ -157,6 +160,7 @@ def test_a_candidate_does_not_notice_its_neighbours_while_lanes_are_refilled(opt
     assert_equal_trees(optimize(take(candidates, order)), take(few, order))
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("count", [1, 5])
 def test_small_populations_agree_with_large_ones(optimize, candidates, planned, count):
     """Neighbours change no bit; fewer lanes are another program, and the compiler rounds it differently."""
@@ -167,6 +171,7 @@ def test_small_populations_agree_with_large_ones(optimize, candidates, planned, 
         np.testing.assert_allclose(ours, theirs, rtol=1e-9, atol=1e-9)
 
 
+@pytest.mark.thorough
 def test_failures_are_told_and_leave_the_others_bit_equal(optimize, candidates, planned):
     """A NaN in a weight, a NaN in the design, and a bob that the torque cannot bring up within the longest time."""
     rows = np.arange(70)
@@ -187,6 +192,7 @@ def with_trajectory(problem, **changes):
     return make_problem(config.model_copy(update={"trajectory": settings}))
 
 
+@pytest.mark.thorough
 def test_the_cheaper_of_two_starts_is_kept(problem, candidates, planned):
     few = take(candidates, np.arange(64))
     both = jax.jit(partial(plan, with_trajectory(problem, starts=2)))(few)
@@ -195,6 +201,7 @@ def test_the_cheaper_of_two_starts_is_kept(problem, candidates, planned):
     assert np.any(both.cost < first * (1 - 1e-6))
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("starts", [1, 2])
 def test_where_the_first_starts_fail_others_follow(problem, candidates, monkeypatch, starts):
     """With few iterations the first starts fail for many; some are solved by others, which change nothing elsewhere."""
@@ -236,6 +243,7 @@ def test_a_motor_whose_limit_is_a_design_moves_as_one_of_that_limit():
     np.testing.assert_allclose(designed.cost, given.cost, rtol=1e-4)
 
 
+@pytest.mark.thorough
 def test_a_share_of_the_motor_is_left_to_the_controller(problem, draw):
     """The motion needs no more than its share, which costs; the controller's limit is the motor's."""
     candidates = draw(8)

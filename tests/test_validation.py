@@ -35,6 +35,7 @@ def _ellipsoids(n: int, knots: int = 3):
     return centers, values, Ellipsoids.about(jnp.asarray(centers.T), jnp.moveaxis(jnp.asarray(values), 0, -1))
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("n", [1, 2, 4])
 def test_held_out_samples_are_uniform_in_their_ellipsoids(n):
     """V / rho of a uniform state is Beta(n/2, 1); its mean is the center, its covariance rho S^-1 / (n + 2)."""
@@ -51,6 +52,7 @@ def test_held_out_samples_are_uniform_in_their_ellipsoids(n):
         assert np.abs(error @ error.T / COUNT - np.eye(n)).max() < 5 * np.sqrt(2 / COUNT)
 
 
+@pytest.mark.thorough
 def test_knots_rounds_and_keys_have_states_of_their_own():
     _, _, sets = _ellipsoids(2)
     same = Ellipsoids(*(jnp.broadcast_to(leaf[..., :1], leaf.shape) for leaf in sets))
@@ -113,6 +115,7 @@ def _tried(verb: str) -> np.ndarray:
     return np.array([TRIALS] * INTERVALS + [TRIALS if verb == "paths" else 0])
 
 
+@pytest.mark.thorough
 def test_known_levels_stand(verb, patient):
     """A thousandth below the level where the first state would fail, none does."""
     levels, trials = patient(0.999 * KNOWN)
@@ -120,6 +123,7 @@ def test_known_levels_stand(verb, patient):
     np.testing.assert_array_equal(trials, _tried(verb))
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("knot", [0, 3])
 def test_an_inflated_level_is_found_out(verb, patient, knot):
     """It ends below the known one, not far, and a clean pass stands behind every level."""
@@ -131,6 +135,7 @@ def test_an_inflated_level_is_found_out(verb, patient, knot):
     np.testing.assert_array_equal(trials, _tried(verb))
 
 
+@pytest.mark.thorough
 def test_a_shrunk_level_has_no_trials(verb, hasty):
     """One round cannot have tried what it has just made."""
     inflated = 0.999 * KNOWN
@@ -142,12 +147,14 @@ def test_a_shrunk_level_has_no_trials(verb, hasty):
     np.testing.assert_array_equal(trials[4:], _tried(verb)[4:] if verb == "intervals" else 0)
 
 
+@pytest.mark.thorough
 def test_what_was_not_tried_has_no_trials(verb):
     levels, trials = _program(verb, rounds=0)(KNOWN)
     np.testing.assert_array_equal(levels, KNOWN)
     np.testing.assert_array_equal(trials, 0)
 
 
+@pytest.mark.thorough
 def test_the_validated_funnel_keeps_the_promise(verb, patient):
     """Levels that are all twice too large: of a million other states of the result fewer fail than the bound says."""
     levels, trials = patient(2 * KNOWN)
@@ -162,6 +169,7 @@ def test_the_validated_funnel_keeps_the_promise(verb, patient):
 # ---- saturation and boxes
 
 
+@pytest.mark.thorough
 def test_a_goal_level_that_saturates_is_found_out_by_paths_to_the_goal():
     """A state at rest beyond limit / 4 is lost: gravity wins over any force."""
     limit = 1.0
@@ -172,6 +180,7 @@ def test_a_goal_level_that_saturates_is_found_out_by_paths_to_the_goal():
     assert np.all(trials == TRIALS)
 
 
+@pytest.mark.thorough
 def test_a_box_fails_the_states_beyond_it(verb):
     """Of an ellipsoid that sticks out of a box no state outside is left over, in whichever knot it was born."""
     box = 0.3
@@ -200,6 +209,7 @@ def test_a_share_is_that_part_of_the_states(share, trials):
     assert len(where) * chosen.states == pytest.approx(wanted, rel=0.05, abs=1)
 
 
+@pytest.mark.thorough
 def test_a_share_with_other_dynamics_is_watched():
     """A motor that is not there in the share's dynamics fails states that the others would keep."""
     problem = linear.problem_of([1e6, 1e6], intervals=INTERVALS, trials=TRIALS, mjx_share=0.5)
@@ -227,11 +237,13 @@ def _compared(other: rollout.Dynamics, problem=PROBLEM, levels=0.999 * KNOWN):
     return jax.device_get(program(jnp.asarray(levels), jax.random.key(3)))
 
 
+@pytest.mark.thorough
 def test_equal_physics_do_not_differ():
     found = _compared(rollout.closed_form(PROBLEM.plant))
     assert (found.states, found.failures, found.difference) == (STATES, 0, 0)
 
 
+@pytest.mark.thorough
 def test_the_largest_difference_is_that_of_the_state_it_names():
     """A force too large by one part in a thousand, on a problem whose motion is known: the same state, by expm."""
     problem = linear.problem_of([1e6, 1e6], intervals=INTERVALS, steps=40)
@@ -250,6 +262,7 @@ def test_the_largest_difference_is_that_of_the_state_it_names():
     assert found.start @ linear.S @ found.start <= 0.999 * KNOWN[found.knot]
 
 
+@pytest.mark.thorough
 def test_failures_under_other_physics_are_counted():
     """Without a motor every state falls; one that is no number differs without limit."""
     motorless = rollout.Dynamics(lambda design, x, u: PROBLEM.plant.dynamics(design, x, 0 * u), large=False)

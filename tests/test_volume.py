@@ -109,6 +109,7 @@ def test_the_push_margin_reaches_the_boundary_and_no_further(n):
     assert np.sum(share > 0.999) == 1
 
 
+@pytest.mark.thorough
 def test_an_impulse_changes_the_pendulum_s_speed_by_its_inertia():
     """m l^2 theta_dot jumps by J: the closed form's margin is m l^2 sqrt(rho / S_22)."""
     evaluation = pipeline.evaluated().take(np.array([pipeline.RTCD]))

@@ -4,90 +4,154 @@
     python launch/bench/readme.py … --check README.md docs/results.md    # exit code 1: rows that stand in neither
 
 Every run is read as `rtcd report` reads it, its certificates checked. Ratios are to the initial candidate's sum as the
-run sampled it; a proved one only from t = 0 on.
+run sampled it; a proved one only from t = 0 on. ± is the spread of the sum over further random numbers, 0.1 % where it
+is less.
 """
 
 import argparse
+import math
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 from rtcd_jax.analysis.report.publication import PAPER
 from rtcd_jax.analysis.report.reading import Run, read_run
 from rtcd_jax.analysis.report.words import words
+from rtcd_jax.config.schema import PolicyConfig
 from rtcd_jax.elite.elite import Elite
 
-SHORT = ("volume sum over the initial candidate's", "the paper", "rtcd_jax, sampled", "proved")
-LONG = (
-    "candidate",
-    "design",
-    "diag Q, R",
-    "sum",
-    "× initial",
-    "integral",
-    "inlet",
-    "geometric mean",
-    "largest knot's share",
-)
 NONE = ""
+Rows = Iterator[tuple[str, ...]]
 
 
 def label(run: Run) -> str:
     """`pendulum RTC-D, with mass and length`: the robot, what is searched beside the weights, another objective."""
-    free = [words(name) for name, variable in run.config.design.items() if variable.free]
-    options = {name: value for name, value in run.best.record["policy"].items() if value != _default(run, name)}
-    searched = f"RTC-D, with {' and '.join(free)}" if free else "RTC, the weights alone"
-    policy = f"; {', '.join(f'{words(name)} {value:.3g}' for name, value in options.items())}" if options else ""
-    objective = run.config.search.objective
-    return f"{run.config.plant.name} {searched}{policy}" + ("" if objective == "sum" else f", objective {objective}")
+    config = run.config
+    free = [words(name) for name, variable in config.design.items() if variable.free]
+    searched = f"RTC-D, with {', '.join(free)}" if free else "RTC, the weights alone"
+    others = {
+        "policy": bool(_options(run.best)),
+        "uncertainty": not config.uncertainty.empty,
+        "nested": config.search.mode == "nested",
+    }
+    told = [name for name, present in others.items() if present]
+    told += [] if config.search.objective == "sum" else [f"objective {words(config.search.objective)}"]
+    return f"{words(config.plant.name)} {'; '.join([searched, *told])}"
 
 
-def _default(run: Run, name: str) -> float | None:
-    return type(run.config.policy)().initial().get(name)
+def _options(elite: Elite) -> dict[str, float]:
+    """The policy's options that are not the paper's."""
+    standard = PolicyConfig().initial()
+    return {name: value for name, value in elite.record["policy"].items() if value != standard.get(name)}
 
 
-def short(run: Run) -> tuple[str, ...]:
-    """README's row."""
-    before = run.initial.volumes["sum"] if run.initial else 0.0
-    free = any(variable.free for variable in run.config.design.values())
-    paper = PAPER.get((run.config.plant.name, free)) if run.config.search.objective == "sum" else None
-    certificate = run.certificates.get("000")
-    proved = (
-        certificate.shown["sum"]
-        if certificate and certificate.guarantee == "proved" and not certificate.start
-        else None
-    )
-    return label(run), _number(paper), _ratio(run.best.volumes["sum"], before), _ratio(proved, before)
-
-
-def long(runs: Sequence[Run]) -> Iterator[tuple[str, ...]]:
-    """The rows of docs/results.md: each initial candidate once, then the best ones."""
-    told = set[str]()
+def gains(runs: Sequence[Run]) -> Rows:
+    """README's: what a search gained, what of it is proved, and what the paper has."""
+    yield "volume sum over the initial candidate's", "the paper", "rtcd_jax, sampled", "proved"
     for run in runs:
-        before = run.initial.volumes["sum"] if run.initial else 0.0
-        if run.initial and (row := _candidate("initial (paper)", run.initial, before)) and row[3] not in told:
-            told.add(row[3])
-            yield row
-        yield _candidate(f"**{label(run)}**", run.best, before)
+        free = any(variable.free for variable in run.config.design.values())
+        paper = PAPER.get((run.config.plant.name, free)) if run.config.search.objective == "sum" else None
+        certificate = run.certificates.get("000")
+        whole = certificate and certificate.guarantee == "proved" and not certificate.start
+        proved = certificate.shown["sum"] if certificate and whole else None
+        yield label(run), _number(paper), _ratio(run, run.best.volumes["sum"]), _ratio(run, proved)
 
 
-def _candidate(name: str, elite: Elite, before: float) -> tuple[str, ...]:
-    record = elite.record
-    weights = (*record["weights"]["q"], *record["weights"]["r"])
-    volumes = [_number(elite.volumes.get(each)) for each in ("sum", "integral", "inlet", "geometric_mean")]
-    share = 100 * record["volumes"]["share_of_largest_knot"]
-    return (
-        name, ", ".join(f"{value:.3g}" for value in record["design"].values()), ", ".join(f"{w:.3g}" for w in weights),
-        volumes[0], _ratio(elite.volumes["sum"], before), *volumes[1:], f"{share:.2g} %",
+def candidates(runs: Sequence[Run]) -> Rows:
+    """Every initial candidate once, before the best one of its run, in all volumes."""
+    yield (
+        "candidate", "design", "diag Q, R", "sum", "× initial", "integral", "inlet", "geometric mean", "push margin",
+        "largest knot's share",
     )  # fmt: skip
+    told = set[tuple[str, ...]]()
+    for run in runs:
+        initial = run.initial and _candidate(f"{words(run.config.plant.name)}, initial", run, run.initial)
+        rows = [initial] if initial and initial not in told else []
+        told.update(rows)
+        yield from rows
+        yield _candidate(f"**{label(run)}**", run, run.best)
 
 
-def _number(value: float | None) -> str:
-    return NONE if value is None else f"{value:.4g}"
+def _candidate(name: str, run: Run, elite: Elite) -> tuple[str, ...]:
+    record = elite.record
+    weights = ", ".join(f"{weight:.3g}" for weight in (*record["weights"]["q"], *record["weights"]["r"]))
+    options = "".join(f"; {words(name)} {value:.2g}" for name, value in _options(elite).items())
+    spread = _spread(elite)
+    total, *others = (
+        _number(elite.volumes.get(each), spread.get(each))
+        for each in ("sum", "integral", "inlet", "geometric_mean", "push")
+    )
+    varied = f" ± {_percent(spread['sum'])}" if spread else ""
+    share = f"{100 * record['volumes']['share_of_largest_knot']:.2g} %"
+    design = ", ".join(f"{value:.3g}" for value in record["design"].values())
+    return name, design, weights + options, total + varied, _ratio(run, elite.volumes["sum"]), *others, share
 
 
-def _ratio(after: float | None, before: float) -> str:
-    return NONE if after is None or before <= 0 else f"{after / before:.3g}"
+def proofs(runs: Sequence[Run]) -> Rows:
+    """The best elites' sampled volumes, and the proved ones below them."""
+    yield "best elite", "guarantee", "inlet", "sum", "integral", "goal region", "intervals", "proving"
+    for run in runs:
+        certificate = run.certificates.get("000")
+        if certificate and certificate.shown:
+            yield label(run), "sampled", *_shown(certificate.sampled), NONE, NONE
+            effort = f"{certificate.intervals}", f"{certificate.seconds:.0f} s"
+            yield NONE, f"**{certificate.guarantee}**", *_shown(certificate.shown), *effort
+
+
+def _shown(volumes: Mapping[str, float]) -> list[str]:
+    return [_number(volumes.get(each)) for each in ("inlet", "sum", "integral", "goal")]
+
+
+def disturbances(runs: Sequence[Run]) -> Rows:
+    """What `rtcd disturb` saw of initial and best candidate."""
+    yield (
+        "run", "all pushes tolerated up to", "sudden ones", "pushes recovered", "score", "model errors survived",
+        "arrived from the best's first ellipsoid × 4",
+    )  # fmt: skip
+    for run in runs:
+        seen = {experiment.name: experiment.summary for experiment in run.experiments}
+        if seen.keys() >= {"impulse", "push_margin", "robustness", "off_nominal"}:
+            push, sudden, robust = seen["impulse"], seen["push_margin"], seen["robustness"]
+            yield (
+                label(run),
+                *(_before_after({name: each[key] for name, each in summary.items()}, form) for summary, key, form in (
+                    (push, "largest_at_all_times", "{:.2g}"), (sudden, "tolerated_at_all_times", "{:.2g}"),
+                    (push, "recovered", "{:.0%}"), (robust, "score", "{:.1%}"), (robust, "model", "{:.0%}"),
+                )),
+                _before_after(seen["off_nominal"]["best ellipsoid x 4"], "{:.0%}"),
+            )  # fmt: skip
+
+
+def _before_after(values: Mapping[str, float | None], form: str) -> str:
+    told = ["none" if values.get(name) is None else form.format(values[name]) for name in ("initial", "best")]
+    return " → ".join(told)
+
+
+TABLES = gains, candidates, proofs, disturbances
+
+
+def _number(value: float | None, spread: float | None = None) -> str:
+    """With the digits that its relative spread leaves, at most four; three where none is known."""
+    if value is None:
+        return NONE
+    digits = 3 if spread is None else min(max(round(1 - math.log10(max(spread, 1e-9))), 1), 4)
+    text = f"{value:#.{digits}g}"
+    return f"{float(text):.0f}" if "e+" in text and value < 1e6 else text.replace(".e", "e").rstrip(".")
+
+
+def _percent(share: float) -> str:
+    return f"{float(f'{100 * share:.1g}'):g} %" if share >= 0.001 else "0.1 %"
+
+
+def _ratio(run: Run, after: float | None) -> str:
+    """To the initial candidate's sum, with the digits that this one's spread leaves."""
+    if after is None or run.initial is None:
+        return NONE
+    return _number(after / run.initial.volumes["sum"], _spread(run.initial).get("sum"))
+
+
+def _spread(elite: Elite) -> Mapping[str, float]:
+    return (elite.record.get("spread") or {}).get("volumes", {})
 
 
 def row(cells: Sequence[str]) -> str:
@@ -96,20 +160,21 @@ def row(cells: Sequence[str]) -> str:
 
 
 def main() -> int:
-    """Prints both tables, or the rows that the given documents lack."""
+    """Prints the tables, or the rows that the given documents lack."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("runs", nargs="+", type=Path)
     parser.add_argument("--check", nargs="+", type=Path, default=[], metavar="FILE")
     options = parser.parse_args()
     runs = [read_run(path) for path in options.runs]
-    tables = {SHORT: [row(short(run)) for run in runs], LONG: [row(cells) for cells in long(runs)]}
+    tables = [[row(cells) for cells in table(runs)] for table in TABLES]
     if options.check:
         text = "\n".join(path.read_text(encoding="utf-8") for path in options.check)
-        missing = [line for rows in tables.values() for line in rows if line not in text]
+        missing = [line for _, *rows in tables for line in rows if line not in text]
         print("\n".join(missing) or "every row stands there")
         return int(bool(missing))
-    for heads, rows in tables.items():
-        print("\n".join([row(heads), row(["---"] * len(heads)), *rows, ""]))
+    for head, *rows in tables:
+        if rows:
+            print("\n".join([head, "|---" * (head.count("|") - 1) + "|", *rows, ""]))
     return 0
 
 

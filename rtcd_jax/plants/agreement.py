@@ -19,8 +19,7 @@ from rtcd_jax.plants.robot import MjcfPlant
 from rtcd_jax.system.errors import UserError
 
 TOLERANCE = 1e-6
-"""Of an acceleration, relative to 1 + the largest of the same state; the inertia that MuJoCo wants of a point mass
-is 1e-12 kg m^2."""
+"""Of an acceleration, relative to 1 + the largest of the same state."""
 
 
 def require_agreement(

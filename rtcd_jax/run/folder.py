@@ -4,15 +4,18 @@ Beside the files of records.py, process 0 writes
 
     provenance.json            versions, device, commit and working time of every start of the run
     state/                     checkpoints of the search, the latest two
+    state.sha256               the digest of each of their files, as `sha256sum -c` reads them
 
 Every file but the JSON lines is replaced as a whole; the lines are cut back to the checkpoint at a resume. Orbax and
 JAX are imported where states are kept.
 """
 
 import contextlib
+import hashlib
 import itertools
 import json
 import os
+import re
 import time
 from collections.abc import Iterable, Iterator
 from functools import partial
@@ -54,6 +57,7 @@ if TYPE_CHECKING:
 
 KEPT_STATES = 2
 _LOCK = ".lock"
+_DIGEST = re.compile(r"^([0-9a-f]{64})  (state/\d+/.+)$", re.MULTILINE)
 _FORGET = "restore it, or remove it: the run then goes on without its history"
 
 State = TypeVar("State")
@@ -115,6 +119,10 @@ class RunFolder:
         return self.path / "state"
 
     @property
+    def _digests_path(self) -> Path:
+        return self.path / "state.sha256"
+
+    @property
     def _lines_path(self) -> Path:
         return self.path / "generations.jsonl"
 
@@ -133,9 +141,14 @@ class RunFolder:
         shapes = self._cluster.replicated(state)
         lost = [f"{self._lines_path} lacks {missing[k]} of the {step} lines before {saved[k].path}"
                 for k, step in enumerate(steps)]  # fmt: skip
+        names = [f"{checkpoint.step}" for checkpoint in saved]
+        seen = self._cluster.on_first(lambda: self._unchanged(names)) or [True] * len(names)
+        unchanged = self._cluster.agreed(np.array(seen, bool))
         refused: dict[int, str] = {}
         for k in sorted(range(len(saved)), key=lambda k: missing[k] > 0):
             try:
+                if not unchanged[k]:
+                    raise _no_state(saved[k])
                 loaded = _load(self._checkpointer, saved[k], shapes)
             except UserError as error:
                 refused[k] = str(error)
@@ -188,8 +201,35 @@ class RunFolder:
             # tensorstore tells of a full disk by ValueError.
             with writing(self._state_path, (OSError, ValueError)), self._cluster.linked():
                 self._checkpointer.save(generation, self._cluster.replicated(state), force=True)
+            self._cluster.on_first(lambda: self._note_digests(f"{generation}"))
         self._cluster.on_first(self.tell_time)
         self._saved = time.monotonic()
+
+    def _note_digests(self, name: str) -> None:
+        """Adds those of the state of this name, and forgets those of states that are gone."""
+        kept = {path: digest for path, digest in self._noted_digests().items() if path.parts[1] != name}
+        noted = {**kept, **self._digests(name)}
+        lines = [f"{digest}  {path}\n" for path, digest in noted.items() if (self._state_path / path.parts[1]).exists()]
+        replace(self._digests_path, "".join(lines).encode())
+
+    def _unchanged(self, names: Iterable[str]) -> list[bool]:
+        """Whether each of these states is as it was saved; True where no digests are noted, as older versions did."""
+        noted: dict[str, dict[Path, str]] = {}
+        for path, digest in self._noted_digests().items():
+            noted.setdefault(path.parts[1], {})[path] = digest
+        return [name not in noted or noted[name] == self._digests(name) for name in names]
+
+    def _noted_digests(self) -> dict[Path, str]:
+        """By the files' paths in the run folder; a damaged line is none."""
+        with reading(self._digests_path, "remove it"):
+            content = self._digests_path.read_text(errors="replace") if self._digests_path.exists() else ""
+        return {Path(path): digest for digest, path in _DIGEST.findall(content)}
+
+    def _digests(self, name: str) -> dict[Path, str]:
+        state = self._state_path / name
+        with reading(state, _FORGET):
+            files = [file for file in sorted(state.rglob("*")) if file.is_file()]
+            return {file.relative_to(self.path): hashlib.sha256(file.read_bytes()).hexdigest() for file in files}
 
     def tell_time(self) -> None:
         """Notes in provenance.json how long this start has worked [s]; a kill leaves what the latest save noted.
@@ -376,7 +416,11 @@ def _load(checkpointer: Any, checkpoint: Any, state: State) -> State:
         by_name = {name_of(path): leaf for path, leaf in loaded}
         return jax.tree_util.tree_map_with_path(old, state)
     except (KeyError, ValueError, OSError, RecursionError) as error:
-        raise UserError(
-            f"{checkpoint.path} is no state of this search: it is damaged, or another version or precision wrote it; "
-            "go on with what provenance.json names, or choose another folder"
-        ) from error
+        raise _no_state(checkpoint) from error
+
+
+def _no_state(checkpoint: Any) -> UserError:
+    return UserError(
+        f"{checkpoint.path} is no state of this search: it is damaged, or another version or precision wrote it; "
+        "go on with what provenance.json names, or choose another folder"
+    )

@@ -175,6 +175,7 @@ def test_the_funnel_of_any_packaged_robot_is_audited(tmp_path, name):
     assert claim_of(found)["robot"]["name"] == name
 
 
+@pytest.mark.thorough
 def test_the_funnel_of_a_robot_of_one_s_own_is_audited(tmp_path, capsys):
     """By the configuration that has it; constants that are not given are the file's."""
     arrays, record = upright.elite("reaction_wheel", inputs=(0.05, 0.02), dt=0.005)
@@ -407,6 +408,7 @@ def audited(tmp_path_factory):
     return out
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("verb", "arguments", "made"),
     [
@@ -424,6 +426,7 @@ def test_every_verb_reads_the_audited_folder(audited, verb, arguments, made, mon
     assert (audited / made).exists()
 
 
+@pytest.mark.thorough
 def test_animate_reads_the_audited_folder(audited):
     """In a process of its own, which owns the graphics."""
     done = subprocess.run([sys.executable, "-m", "rtcd_jax", "animate", str(audited)], capture_output=True, text=True)

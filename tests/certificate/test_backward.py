@@ -66,6 +66,7 @@ def test_level_sets_take_over_from_free_shapes_inside_them(funnel):
     assert np.isfinite(merit(leveled(mixed, DIRECTIONS)))
 
 
+@pytest.mark.thorough
 def test_the_largest_funnel_of_all_is_taken(funnel, monkeypatch):
     grown = backward.grown(funnel, DIRECTIONS)
     assert merit(grown) > merit(funnel) + 0.05

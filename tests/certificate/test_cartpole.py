@@ -31,6 +31,7 @@ def ball(count):
     return radius * y / np.linalg.norm(y, axis=0)
 
 
+@pytest.mark.thorough
 def test_the_report_names_the_rail(proved):
     report = check.check(proved)
     words = check.sentence(report)
@@ -40,6 +41,7 @@ def test_the_report_names_the_rail(proved):
     assert {"free", "high"} <= {case for piece in proved["funnel"] for case in piece["cases"]}
 
 
+@pytest.mark.thorough
 def test_no_motion_leaves_what_is_proved(proved):
     loop = Simulated(proved, rate=lambda x, u, p: balance.rate(x, u, balance.PARAMETERS | p))
     for first in range(len(loop.funnel)):

@@ -94,6 +94,7 @@ def test_a_funnel_that_ends_before_the_start_is_told(tmp_path):
     assert any(line.split()[:2] == ["000", "0.05"] for line in screen.text.splitlines())
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("rung", ["certified", "proved"])
 def test_a_run_is_certified_in_processes_of_its_own(tmp_path, rung):
     run, screen = folder_of(tmp_path), Screen()
@@ -108,6 +109,7 @@ def test_a_run_is_certified_in_processes_of_its_own(tmp_path, rung):
     assert not list((run / "certificates").glob(".*"))
 
 
+@pytest.mark.thorough
 def test_another_solver_proves_the_funnel_too(tmp_path, content):
     """By the same checker, to nearly the same levels."""
     run, screen = folder_of(tmp_path), Screen()
@@ -121,6 +123,7 @@ def refuse_to_prove(*_):
     raise AssertionError("a finished proof is made again")
 
 
+@pytest.mark.thorough
 def test_a_finished_proof_is_not_made_again(tmp_path, monkeypatch):
     """The same file, and the table of it; another way, another claim or another file is proved."""
     run, first, second = folder_of(tmp_path), Screen(), Screen()
@@ -166,6 +169,7 @@ def _forged(file):
     return json.dumps(resealed(content)).encode()
 
 
+@pytest.mark.thorough
 def test_an_elite_is_proved_by_one_process_at_a_time(tmp_path):
     run = folder_of(tmp_path)
     seen = []
@@ -219,6 +223,7 @@ class Killed(Exception):
     pass
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("optimized", [False, True])
 def test_a_killed_search_goes_on_to_the_same_certificate(tmp_path, optimized):
     whole, killed = folder_of(tmp_path / "whole"), folder_of(tmp_path / "killed")

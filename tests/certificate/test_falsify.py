@@ -98,6 +98,7 @@ def test_halved_steps_measure_the_error(content):
     assert errors[0] > 4 * errors[1] > 16 * errors[2] > 0
 
 
+@pytest.mark.thorough
 def test_the_command_line(run, tmp_path, capsys):
     command = ["falsify", str(run), "--rollouts", "200"]
     assert cli.main(command) == 0
@@ -114,6 +115,7 @@ def test_the_command_line(run, tmp_path, capsys):
     assert "was changed: its digest is another" in capsys.readouterr().err
 
 
+@pytest.mark.thorough
 def test_a_killed_falsification_goes_on(run, tmp_path, monkeypatch):
     monkeypatch.setattr(falsify, "CHUNK", 64)
     file = tmp_path / "000.json"

@@ -324,6 +324,7 @@ ABSURD = {
 }
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("change", ABSURD)
 def test_what_is_readable_and_absurd_is_falsified_or_told_in_a_line(change, content, tmp_path, capfd):
     """In a bounded time, without a warning of numpy's on the workers' stderr. Large gains may be right."""
@@ -426,6 +427,7 @@ def judged(text, rounds, seed, asked):
     return codes
 
 
+@pytest.mark.thorough
 def test_hostile_files_are_refused_in_a_line_or_prove_what_is_true(text, asked):
     codes = judged(text, 60, 1, asked)
     assert codes[1] > 30

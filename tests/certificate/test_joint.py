@@ -36,6 +36,7 @@ def fastest(loop):
     return np.array([*growth, loop.goal_growth(1.0, DIRECTIONS)])
 
 
+@pytest.mark.thorough
 def test_levels_become_one(funnel):
     """V falls everywhere at the decay margin, no faster where the funnel is tightest; the goal's level is 1."""
     assert goal_level(funnel, DIRECTIONS) == pytest.approx(1, abs=1e-9)
@@ -87,6 +88,7 @@ def test_a_loop_without_a_funnel_stays_as_it_is():
     assert elite.largest(loop) is loop
 
 
+@pytest.mark.thorough
 def test_its_funnels_are_larger_and_proved(tmp_path):
     arrays, record = swing.elite()
     sums = []
@@ -99,6 +101,7 @@ def test_its_funnels_are_larger_and_proved(tmp_path):
     assert sums[1] > 1.5 * sums[0]
 
 
+@pytest.mark.thorough
 def test_a_goal_region_of_free_shape_is_larger_and_all_of_it_arrives():
     upright = Upright(PAPER, (10.0, 1.0), 1.0)
     free = elite.largest(upright.loop)

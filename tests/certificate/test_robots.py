@@ -226,6 +226,7 @@ def proof(proof_text):
     return json.loads(proof_text)
 
 
+@pytest.mark.thorough
 def test_two_swinging_joints_are_proved_and_not_falsified(acrobot, proof):
     report = check.check(proof)
     assert standing(acrobot, "000").proved
@@ -262,6 +263,7 @@ LIES = {
 }
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("lie", LIES)
 def test_what_is_not_so_of_two_swinging_joints_is_refused_with_its_place(proof, lie):
     change, reason = LIES[lie]

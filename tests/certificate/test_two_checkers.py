@@ -35,6 +35,7 @@ def stored(kind):
     return gzip.decompress((FILES / f"{kind}.json.gz").read_bytes()).decode()
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("kind", KINDS)
 def test_both_prove_the_same(second, tmp_path, kind):
     """Word for word, with the smallest margin and the claim's digest."""
@@ -44,6 +45,7 @@ def test_both_prove_the_same(second, tmp_path, kind):
     assert verdict == first_verdict(content)
 
 
+@pytest.mark.thorough
 def test_what_was_just_proved_is_proved_by_both(second, tmp_path, content):
     assert second_verdict(second, tmp_path / "x.json", content) == first_verdict(content)
 
@@ -208,6 +210,7 @@ def judged(kind, rounds, seed, second, path):
     return counts
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("kind", KINDS)
 def test_both_judge_mutations_alike(second, tmp_path, kind):
     counts = judged(kind, 3, 1, second, tmp_path / "x.json")
@@ -244,6 +247,7 @@ def hostile(text, rounds, seed, second, path):
     return codes
 
 
+@pytest.mark.thorough
 def test_hostile_files_get_the_same_exit_code(second, tmp_path, text, capsys):
     assert hostile(text, 60, 4, second, tmp_path / "x.json")[1] > 30
 

@@ -137,6 +137,7 @@ FULL = {
 }
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("verb", FULL)
 def test_a_full_disk(verb, run, capsys):
     before = {path: path.read_bytes() for path in run.rglob("*") if path.is_file()}

@@ -125,6 +125,7 @@ def whole(finished, as_in_a_process, tmp_path, monkeypatch):
     return verify_and_disturb(Path(shutil.copytree(finished, "whole")))
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("verb", VERBS)
 def test_a_damaged_run_is_read_or_refused(verb, whole, capsys):
     codes = [read_damaged(whole, verb, seed, capsys) for seed in range(20)]
@@ -188,17 +189,12 @@ def searched(tmp_path, monkeypatch):
     return Path("whole"), config
 
 
-ORBAX_GIVES_UP = pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
-"""What it was reading when it met the damage is never awaited."""
-
-
-@ORBAX_GIVES_UP
+@pytest.mark.thorough
 def test_a_damaged_search_goes_on_or_is_refused(searched):
     begun = [resume_damaged(*searched, seed) for seed in range(15)]
     assert {3, 2} <= set(begun)
 
 
-@ORBAX_GIVES_UP
 @pytest.mark.slow
 def test_many_damaged_searches_go_on_or_are_refused(searched, capsys):
     begun = [resume_damaged(*searched, 1000 + seed) for seed in range(250)]

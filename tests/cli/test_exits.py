@@ -160,6 +160,7 @@ sys.exit(cli.main())
     ends_interrupted(process)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("delay", [0.0, 4.0])
 def test_an_interrupt_ends_a_search_that_compiles(delay, tmp_path):
     process = start(*RTCD, "optimize", SMOKE, "--run", str(tmp_path / "run"), JAX_COMPILATION_CACHE_DIR=str(tmp_path))

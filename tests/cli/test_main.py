@@ -287,6 +287,7 @@ def test_double_precision_on_every_core():
     assert prepared({}) == f"{cores()} float64"
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     "chosen", [{"JAX_NUM_CPU_DEVICES": "3"}, {"XLA_FLAGS": "--xla_force_host_platform_device_count=3"}]
 )

@@ -49,6 +49,7 @@ def dry(robot):
     return done
 
 
+@pytest.mark.thorough
 def test_what_is_understood_is_said_and_nothing_is_run(robot):
     done = dry(robot)
     assert done.returncode == 0

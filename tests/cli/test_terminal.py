@@ -61,11 +61,13 @@ def sent(folder):
     return ended
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("verb", READERS)
 def test_a_verb_that_reads_a_run(verb, sent):
     ends_well(*sent[verb], draws=READERS[verb][1])
 
 
+@pytest.mark.thorough
 def test_what_the_options_say_reaches_the_work(sent, folder):
     verified = json.loads((folder / "run" / "verification" / "000.json").read_text())
     assert (verified["states"], verified["seed"]) == (20, 3)
@@ -79,6 +81,7 @@ def test_what_the_options_say_reaches_the_work(sent, folder):
     assert json.loads(exported.read_text())["elite"] == "initial"
 
 
+@pytest.mark.thorough
 def test_results_reach_the_page_that_is_there(sent):
     """`report` comes before `disturb` and `certify`, and after `verify`."""
     assert "report.html shows this, too" in sent["disturb"][1]
@@ -106,6 +109,7 @@ def test_a_refinement(folder):
     ends_well(code, screen, draws=True)
 
 
+@pytest.mark.thorough
 def test_a_certificate_is_checked_and_falsified(sent, folder):
     code, screen = in_terminal("check", "run/certificates/000.json", folder=folder)
     ends_well(code, screen, draws=False)
@@ -118,6 +122,7 @@ def test_an_audit(folder):
     ends_well(*in_terminal("audit", *arguments, folder=folder), draws=False)
 
 
+@pytest.mark.thorough
 def test_an_animation(folder, backend):
     code, screen = in_terminal("animate", "run", "--to", "videos", folder=folder, MUJOCO_GL=backend)
     ends_well(code, screen, draws=True)
@@ -127,6 +132,7 @@ def test_an_animation(folder, backend):
 # ---- verbs that evaluate candidates
 
 
+@pytest.mark.thorough
 def test_a_search(searched):
     folder, *ended = searched
     ends_well(*ended, draws=True)
@@ -134,6 +140,7 @@ def test_a_search(searched):
     assert (folder / "report.html").is_file()
 
 
+@pytest.mark.thorough
 def test_a_sweep_goes_on_after_a_case_that_fails(searched, small, tmp_path):
     """Its first case finds the run of another configuration in its place; its second one is finished but for its page,
     which cannot be made."""
@@ -153,6 +160,7 @@ def test_a_sweep_goes_on_after_a_case_that_fails(searched, small, tmp_path):
     assert screen.count(f"{GENERATIONS}/{GENERATIONS}") == 2
 
 
+@pytest.mark.thorough
 def test_a_study_of_the_scaling(small, tmp_path):
     arguments = ["--populations", "6", "--devices", "2", "--repeats", "1", "--folder", "scaled"]
     ends_well(*in_terminal("scale", small.config, *arguments, folder=tmp_path, **small.environment), draws=True)

@@ -108,6 +108,7 @@ def test_refused_in_one_line(text, words):
     assert line.isprintable()
 
 
+@pytest.mark.thorough
 def test_of_many_errors_twenty_are_shown():
     lines = refusal(EXAMPLE + "".join(f"k{i}: 1\n" for i in range(20_000)))
     assert lines[0] == "x.yaml: 20000 errors"

@@ -93,6 +93,7 @@ def around_the_funnel(bundle, count, reach, seed):
         yield t, now.x + now.axes @ away, away @ away
 
 
+@pytest.mark.thorough
 def test_the_input_is_that_of_the_verifications_loop(export, loop):
     elite, control = export.bundle.elite, loop[0]
     loop_of = ClosedLoop.of(elite, next(simulators_of(elite, 2)).dynamics)
@@ -102,6 +103,7 @@ def test_the_input_is_that_of_the_verifications_loop(export, loop):
         np.testing.assert_allclose(control(t, x), policy(t, x[None])[0], rtol=1e-8, atol=1e-8)
 
 
+@pytest.mark.thorough
 def test_the_ratio_is_one_on_the_boundary_and_v_over_rho_at_the_knots(export, loop):
     elite, monitor = export.bundle.elite, loop[1]
     for t, x, ratio in around_the_funnel(export.bundle, 100, reach=2, seed=1):
@@ -176,6 +178,7 @@ def test_before_the_start_its_first_instant_is_held(export, loop):
     assert monitor(-1.0, x).ratio == monitor(0.0, x).ratio
 
 
+@pytest.mark.thorough
 def test_c_mujoco_under_the_exported_controller_gives_the_verifications_outcome(export, loop):
     """The same states, half of them far outside the funnel, step by step: the same verdicts on every one."""
     elite, (control, monitor) = export.bundle.elite, loop
@@ -331,6 +334,7 @@ def two(tmp_path_factory):
     return path, bundles
 
 
+@pytest.mark.thorough
 @needs_compiler
 def test_two_exports_live_in_one_c_program(two):
     path, bundles = two
@@ -350,6 +354,7 @@ def test_two_exports_live_in_one_c_program(two):
     assert done[2:] == ["1", "1"]
 
 
+@pytest.mark.thorough
 def test_two_exports_live_in_one_python_process(two):
     """As the folder's README imports them."""
     path, bundles = two
@@ -361,6 +366,7 @@ def test_two_exports_live_in_one_python_process(two):
     assert done.stdout.split() == ["2", "4"]
 
 
+@pytest.mark.thorough
 @needs_compiler
 def test_two_elites_of_one_robot_are_told_apart_by_a_name(tmp_path):
     run = run_folder(tmp_path / "run", "pendulum")

@@ -32,6 +32,7 @@ def table(path):
     return header, np.array(rows, float)
 
 
+@pytest.mark.thorough
 def test_the_trajectory_has_the_columns_of_the_toolkits(export):
     arrays, _ = read_elite(export.run / "elites", "000")
     header, rows = table(export.folder / "trajectory.csv")
@@ -88,6 +89,7 @@ def test_the_mark_has_the_digest_of_every_file(export):
         assert hashlib.sha256((export.folder / name).read_bytes()).hexdigest() == digest
 
 
+@pytest.mark.thorough
 def test_exports_of_the_same_elite_are_equal_bit_by_bit(export, tmp_path):
     output = Output()
     export_run(export.run, 0, tmp_path / "again", output.console)
@@ -104,6 +106,7 @@ def listing(target, **files):
     (target / "export.json").write_text(json.dumps(mark))
 
 
+@pytest.mark.thorough
 def test_a_former_export_is_replaced_and_its_stale_files_go(run, tmp_path):
     target = tmp_path / "lab"
     export_run(run, 0, target, Output().console)
@@ -121,6 +124,7 @@ def test_a_former_export_is_replaced_and_its_stale_files_go(run, tmp_path):
     assert (target / "gains.csv").read_text() != "old"
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("name", ["../precious.txt", "{absolute}", "sub/../../precious.txt", "..\\precious.txt"])
 def test_what_a_former_exports_mark_names_elsewhere_is_not_touched(run, tmp_path, name):
     target, precious = tmp_path / "lab", tmp_path / "precious.txt"
@@ -132,6 +136,7 @@ def test_what_a_former_exports_mark_names_elsewhere_is_not_touched(run, tmp_path
     assert precious.read_text() == "mine"
 
 
+@pytest.mark.thorough
 def test_no_link_is_followed_or_deleted(run, tmp_path):
     target, precious = tmp_path / "lab", tmp_path / "precious.txt"
     precious.write_text("mine")
@@ -148,6 +153,7 @@ def test_no_link_is_followed_or_deleted(run, tmp_path):
     assert any("left where they are" in line and "stale.txt" in line for line in output.lines)
 
 
+@pytest.mark.thorough
 def test_a_file_that_was_changed_since_is_not_deleted(run, tmp_path):
     target = tmp_path / "lab"
     export_run(run, 0, target, Output().console)
@@ -160,6 +166,7 @@ def test_a_file_that_was_changed_since_is_not_deleted(run, tmp_path):
     assert not (target / "pendulum_000_controller.c").exists()
 
 
+@pytest.mark.thorough
 def test_a_file_that_no_export_has_written_is_not_replaced(run, tmp_path):
     target = tmp_path / "lab"
     export_run(run, 0, target, Output().console)
@@ -182,6 +189,7 @@ def test_a_mark_that_no_export_has_written_is_none(run, tmp_path, mark):
         export_run(run, 0, target, Output().console)
 
 
+@pytest.mark.thorough
 def test_an_export_that_a_kill_has_left_half_done_says_so_and_is_taken_up(run, tmp_path, monkeypatch):
     target = tmp_path / "lab"
 
@@ -225,6 +233,7 @@ def test_a_candidate_without_a_funnel_is_not_exported(tmp_path):
         export_run(run, "initial", tmp_path / "lab", Output().console)
 
 
+@pytest.mark.thorough
 def test_a_proved_elites_claim_stands_wherever_its_controller_does(proved):
     content = json.loads((proved.folder / "certificate.json").read_text())
     claim = check.digest(content["claim"])
@@ -256,6 +265,7 @@ def heavier(content):
 WORTHLESS = {"refused": cheat, "of another elite": heavier, "damaged": lambda content: "{"}
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("verdict", WORTHLESS)
 def test_a_certificate_that_does_not_prove_this_elite_does_not_go_along(proved, tmp_path, verdict):
     run = shutil.copytree(proved.run, tmp_path / "run")

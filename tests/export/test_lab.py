@@ -28,6 +28,7 @@ def turned(export, random):
         yield t, x, x + 2 * np.pi * random.integers(-3, 4, x.size) * bundle.angles
 
 
+@pytest.mark.thorough
 def test_whole_turns_are_taken_out_of_wrapped_angles_alone(export):
     plain, wrapped = export.module.Controller(), export.module.Controller(wrapped=True)
     differs = False

@@ -34,6 +34,7 @@ def standing(dt=DT):
     return replace(elite, K=np.array([gain] * KNOTS), K_goal=gain, S=np.array([s] * KNOTS)), a - b @ gain
 
 
+@pytest.mark.thorough
 def test_a_funnel_whose_boundary_is_a_motion_has_a_rate_for_what_starts_a_little_inside():
     """Its ellipsoids are images of the first one under the flow: a held input leaves them at any rate, if by little."""
     elite, loop = standing()

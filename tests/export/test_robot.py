@@ -33,6 +33,7 @@ def described(request, export):
     return model
 
 
+@pytest.mark.thorough
 def test_mass_matrix_gravity_and_damping_are_the_designs(export, described):
     random, joints = np.random.default_rng(0), export.bundle.model.nv
     for _ in range(10):

@@ -94,6 +94,7 @@ LOOPS = {
 }
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("number", range(4))
 def test_the_controller_swings_up_in_a_toolkits_own_loop(export, number):
     """From 0.02 off the nominal start into the goal, for as long as the goal's LQR needs."""

@@ -67,6 +67,7 @@ def random_row(n, count=4):
     return ellipsoid.Ellipsoids.about(centers, matrix)
 
 
+@pytest.mark.thorough
 def test_points_of_a_row_lie_on_the_levels_they_were_asked_for():
     row = random_row(3)
     random = np.random.default_rng(0)
@@ -80,6 +81,7 @@ def test_points_of_a_row_lie_on_the_levels_they_were_asked_for():
         assert float(row.level(x)[k, 2, 3]) == pytest.approx(float(error @ row.values[:, :, k] @ error), rel=1e-12)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("n", [1, 2, 4])
 def test_the_way_to_the_ball_is_the_way_back_from_it(n):
     """points(radii, y) -> radii y, and |y|^2 = V of any x."""

@@ -62,6 +62,7 @@ def autodiff(point, index):
     return slopes, gradient, jax.hessian(lagrangian)(z)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("index", range(P))
 def test_the_step_is_differentiated_exactly(point, expansion, index):
     slopes, gradient, hessian = autodiff(point, index)
@@ -71,6 +72,7 @@ def test_the_step_is_differentiated_exactly(point, expansion, index):
         np.testing.assert_allclose(dense(row)[..., index], hessian[i, : i + 1], rtol=1e-11, atol=1e-11)
 
 
+@pytest.mark.thorough
 def test_what_a_robot_does_not_depend_on_is_known(expansion):
     """Translations: the first column of the slopes is the identity's, that of the Hessian zero."""
     assert [row[0] for row in expansion.jacobian] == [1.0, 0.0, 0.0]

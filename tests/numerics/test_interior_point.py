@@ -73,11 +73,13 @@ def solution():
     return jax.tree.map(np.asarray, optimize(PARAMETERS, MOST))
 
 
+@pytest.mark.thorough
 def test_what_can_be_solved_is_solved_from_both_guesses(solution):
     np.testing.assert_array_equal(solution.solved, np.array([[True] * 2] * 4 + [[False] * 2] * 2))
     np.testing.assert_allclose(solution.cost[:4, 0], solution.cost[:4, 1], rtol=1e-4)
 
 
+@pytest.mark.thorough
 def test_the_minimum_time_is_that_of_full_force_to_the_middle_and_back(solution):
     """T = 2 sqrt(distance / acceleration), and force +2 then -2: the cart of gain 1/2 stays below its speed limit."""
     assert N * solution.h[FAST] == pytest.approx(np.full(2, 2 * np.sqrt(1 / (0.5 * FORCE))), rel=1e-4)
@@ -181,6 +183,7 @@ def test_iterations_are_counted_to_the_one_that_solves(solution):
     np.testing.assert_array_equal(one_less.solved[:4], solution.iterations[:4] < needed)
 
 
+@pytest.mark.thorough
 def test_problems_without_allowance_are_left_out_and_change_no_other(solution):
     some = jax.tree.map(np.asarray, optimize(PARAMETERS, np.where(np.isin(np.arange(6), [FAST, WEAK]), 0, MOST)))
     others = [FRUGAL, SLOW_CART, SWAYING, BROKEN]
@@ -212,6 +215,7 @@ def test_single_precision_stays_single():
         assert getattr(shapes, name).dtype == jnp.float32
 
 
+@pytest.mark.thorough
 def test_a_step_whose_box_has_no_width_is_held_and_the_effort_is_the_least_for_it():
     """On a double integrator: the shortest vector of inputs that meets both end conditions."""
     h = 0.3

@@ -80,6 +80,7 @@ def unknowns(step, p):
     return np.concatenate([np.ravel(part) for part in parts])
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("seed", range(3))
 def test_the_step_leaves_no_residual_in_the_dense_system(seed):
     problem = random_subproblem(seed)
@@ -104,6 +105,7 @@ def test_the_step_is_the_dense_solution():
         np.testing.assert_allclose(ours, exact, rtol=1e-7, atol=1e-9 * np.max(np.abs(exact)))
 
 
+@pytest.mark.thorough
 def test_known_numbers_are_entries_like_others():
     """Structure of a robot: a column of the slopes that is zero, a slope of one, a Hessian with zeros."""
     problem = random_subproblem()
@@ -161,6 +163,7 @@ def indefinite_stages(shift, count=64):
     )
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(("shift", "units"), [(0.6, 1.0), (1.0, 1.0), (1.5, 1.0), (1.0, 1e3)])
 def test_the_flag_is_that_of_the_pinned_end_where_stages_are_indefinite(shift, units):
     """Also in other units of the first state."""

@@ -63,6 +63,7 @@ def test_short_loops_are_written_out_on_a_gpu_alone():
             assert double(1.0) == 32
 
 
+@pytest.mark.thorough
 def test_the_kkt_sweep_of_a_gpu_solves_the_same_system(monkeypatch):
     monkeypatch.setattr(kkt, "UNROLLED_STATES", 1)  # written out it takes a CPU's compiler a minute
     dense = random_subproblem()

@@ -56,6 +56,7 @@ def assert_symmetric_positive_definite(values):
     assert np.all(np.linalg.eigvalsh(np.moveaxis(values, -1, 0)) > 0)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(("n", "m", "r"), SIZES)
 def test_infinite_horizon_is_scipys_algebraic_solution(n, m, r):
     a, b, spread, cost = random_systems(n, m, r)
@@ -96,6 +97,7 @@ def test_an_interval_is_the_hamiltonians_exponential(n, m, r):
             assert_close_matrices(ours[..., p], theirs, 2e-7)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(("n", "m", "r"), SIZES)
 @pytest.mark.parametrize("duration", [1e-5, 2e-3, 0.02])
 def test_enough_doublings_are_as_exact_at_every_duration(n, m, r, duration):
@@ -128,6 +130,7 @@ def test_a_short_interval_is_right_to_third_order():
     np.testing.assert_allclose(np.log2(np.divide(*errors)), 4, atol=0.25)
 
 
+@pytest.mark.thorough
 def test_neighbouring_intervals_compose_to_the_whole_in_any_grouping():
     a, _, spread, cost = random_systems(4, 2, 1.0)
     first, second, third = (constant_interval(s * a, spread, s * cost, 0.02) for s in (1.0, 0.5, 2.0))

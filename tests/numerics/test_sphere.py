@@ -53,6 +53,7 @@ SPECTRA = {
 }
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("spectrum", SPECTRA)
 def test_the_largest_value_of_a_quadratic_is_the_largest_eigenvalue(spectrum):
     """From everywhere: a linear map has no other maximum. Ten steps, as eigenvalues may be near each other."""
@@ -128,6 +129,7 @@ def _clipped(y):
     return jnp.stack([y[0] + 0.5 * y[1] + 0.2 * u, 0.7 * y[1] + y[0] + 0.9 * u, 0.5 * y[2], 0.4 * y[3] + 0.1 * u])
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("f", [_clipped, lambda y: jnp.tanh(3 * y) + 0.2 * y, lambda y: jnp.sin(4 * y)])
 def test_no_step_goes_down(f):
     y = _unit(4, 300)
@@ -158,6 +160,7 @@ def test_where_the_map_saturates_the_plain_model_overshoots_and_the_climb_does_n
     assert np.all(heights > 0.7 * largest)
 
 
+@pytest.mark.thorough
 def test_of_a_saturated_plant_the_best_of_a_few_climbers_is_that_of_a_dense_search():
     """Twelve are always enough; a random direction in twelve is 5 % below."""
     dense = _height(_clipped, _unit(4, 300_000, seed=1)).max()
@@ -188,6 +191,7 @@ def test_everywhere_not_finite_leaves_all_where_they_are():
     np.testing.assert_array_equal(_climbed(lambda y: jnp.nan * y, y, 3), y)
 
 
+@pytest.mark.thorough
 def test_neighbors_do_not_matter_and_no_step_leaves_y():
     j, _ = _with_singular_values(SPECTRA["apart"])
     y = _unit(4, 5, 6)
@@ -197,6 +201,7 @@ def test_neighbors_do_not_matter_and_no_step_leaves_y():
     np.testing.assert_allclose(together[:, 2, 3], alone, rtol=1e-12, atol=1e-12)
 
 
+@pytest.mark.thorough
 def test_single_precision_stays_single_and_climbs_as_high():
     j, _ = _with_singular_values(SPECTRA["apart"])
     j = j.astype(np.float32)

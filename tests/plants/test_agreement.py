@@ -36,6 +36,7 @@ def pendulum(*replacements):
     return make_problem(parse(data))
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     "replacements",
     {

@@ -30,6 +30,7 @@ def test_the_rods_dynamics_are_the_authors():
     np.testing.assert_allclose(found, np.stack([xd, thd, cart, pole]), rtol=1e-11, atol=1e-12)
 
 
+@pytest.mark.thorough
 def test_the_upright_linearization_is_the_authors():
     """Their numbers have four decimals."""
     a, b = jax.jacfwd(packaged("cartpole").dynamics, (1, 2))(_design(), UPRIGHT, jnp.zeros(1))

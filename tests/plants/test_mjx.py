@@ -85,6 +85,7 @@ def test_c_accelerations_of_fewer_states_than_the_capacity(robot):
     np.testing.assert_array_equal(dynamics(x[5:], u[5:]), everything[5:])
 
 
+@pytest.mark.thorough
 def test_mjx_step_is_the_closed_forms_runge_kutta_step(robot, mjx_step):
     """Step by step along 100 steps; the tolerance is the bodies' own inertia, as above."""
     closed_form, x = runge_kutta(robot), robot.x
@@ -94,6 +95,7 @@ def test_mjx_step_is_the_closed_forms_runge_kutta_step(robot, mjx_step):
         x = ours
 
 
+@pytest.mark.thorough
 def test_mjx_step_of_batched_designs_is_c_mujocos_on_recompiled_models(robot, mjx_step):
     """Same formulas in another order of summation: some ten roundings of values of about 100."""
     found = mjx_step(robot.designs, robot.x, robot.u, DT)
@@ -109,6 +111,7 @@ def test_mjx_step_takes_a_traced_time_step(robot, mjx_step):
         np.testing.assert_allclose(found[0], expected, rtol=1e-12, atol=1e-12)
 
 
+@pytest.mark.thorough
 def test_mjx_step_of_a_batch_is_the_loop_of_steps(robot, mjx_step):
     step = jax.jit(MjxStepper(robot.plant).step)
     batched = mjx_step(robot.designs, robot.x, robot.u, DT)
@@ -117,6 +120,7 @@ def test_mjx_step_of_a_batch_is_the_loop_of_steps(robot, mjx_step):
         np.testing.assert_allclose(batched[index], single, rtol=1e-14, atol=1e-14)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("dtype", [pytest.param(jnp.float32, marks=pytest.mark.slow), jnp.float64])
 def test_mjx_scans_under_strict_promotion_in_the_states_dtype(robot, dtype):
     stepper = MjxStepper(robot.plant)
@@ -138,6 +142,7 @@ def test_mjx_scans_under_strict_promotion_in_the_states_dtype(robot, dtype):
     np.testing.assert_allclose(found, reference, rtol=tolerance, atol=tolerance)
 
 
+@pytest.mark.thorough
 def test_the_template_belongs_to_no_trace(robot):
     """A stepper made for the first time inside jit must not leak tracers into the next one."""
 

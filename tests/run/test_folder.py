@@ -78,6 +78,7 @@ def assert_killed_equals_uninterrupted(tmp_path, mode, kills, seconds, seed):
     assert begun[-1] > 0, "no start went on from a saved state"
 
 
+@pytest.mark.thorough
 def test_killed_at_random_moments_a_run_ends_with_the_same_bytes(tmp_path):
     assert_killed_equals_uninterrupted(tmp_path, "nested", kills=3, seconds=0.08, seed=1)
 
@@ -110,6 +111,7 @@ class Killed(BaseException):
     """Nothing between the raising line and the test may run on, but what `with` releases."""
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("generations", [0, 1, 7])
 def test_lines_after_the_saved_generation_and_a_torn_one_are_cut(tmp_path, generations):
     config = experiment(generations=9)
@@ -129,6 +131,7 @@ def test_lines_after_the_saved_generation_and_a_torn_one_are_cut(tmp_path, gener
     assert results(tmp_path / "torn") == results(tmp_path / "whole")
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("step", ["format.json", "config.yaml", "provenance.json", "generations.jsonl"])
 @pytest.mark.parametrize("after", [False, True])
 def test_a_folder_whose_creation_was_killed_at_any_file_is_taken_up(tmp_path, monkeypatch, step, after):
@@ -173,6 +176,7 @@ def test_replacing_a_file_leaves_the_old_one_or_the_new_one(tmp_path, monkeypatc
     assert list(tmp_path.iterdir()) == [path]
 
 
+@pytest.mark.thorough
 def test_a_saved_state_is_restored_bit_by_bit_with_its_types(tmp_path):
     config = experiment("nested")
     plan = plan_of(config)
@@ -319,6 +323,7 @@ def test_a_folder_that_cannot_be_created_is_named(tmp_path):
     assert "cannot write" in refused(tmp_path / "file" / "run")
 
 
+@pytest.mark.thorough
 def test_two_processes_cannot_work_on_one_folder(tmp_path):
     process = driver(tmp_path / "run", "joint", 5.0)
     try:
@@ -401,6 +406,7 @@ def damaged(state):
         file.write_bytes(file.read_bytes()[:10])
 
 
+@pytest.mark.thorough
 def test_a_damaged_newest_state_is_set_aside_and_the_one_before_goes_on(tmp_path):
     config, plan = at_generations(tmp_path / "run", 3, 6)
     damaged(tmp_path / "run" / "state" / "6")
@@ -429,6 +435,37 @@ def test_where_every_state_is_damaged_nothing_is_moved(tmp_path):
     assert not (tmp_path / "run" / "state.damaged").exists()
 
 
+def largest_file(state):
+    return max((file for file in state.rglob("*") if file.is_file()), key=lambda file: file.stat().st_size)
+
+
+def test_one_other_byte_in_a_state_is_seen_before_it_is_read(tmp_path):
+    config, plan = at_generations(tmp_path / "run", 3, 6)
+    file = largest_file(tmp_path / "run" / "state" / "6")
+    content = bytearray(file.read_bytes())
+    content[len(content) // 2] ^= 1
+    file.write_bytes(content)
+    with RunFolder.open(tmp_path / "run", config) as folder:
+        assert int(folder.restore(begin(plan)).generation) == 3
+        (note,) = folder.notes
+    assert "state/6 is no state of this search: it is damaged" in note
+
+
+def test_the_digests_are_those_of_the_kept_states_as_sha256sum_reads_them(tmp_path):
+    run = tmp_path / "run"
+    at_generations(run, 2, 4, 6)
+    subprocess.run(["sha256sum", "--check", "--strict", "--quiet", "state.sha256"], cwd=run, check=True)
+    noted = {line.split("  ")[1] for line in (run / "state.sha256").read_text().splitlines()}
+    assert noted == {f"{file.relative_to(run)}" for file in (run / "state").rglob("*") if file.is_file()}
+
+
+def test_a_state_without_digests_is_read_as_older_versions_left_it(tmp_path):
+    config, plan = at_generations(tmp_path / "run", 3)
+    (tmp_path / "run" / "state.sha256").unlink()
+    with RunFolder.open(tmp_path / "run", config) as folder:
+        assert int(folder.restore(begin(plan)).generation) == 3
+
+
 def keep_lines(run, kept, damage=b""):
     lines = (run / "generations.jsonl").read_bytes().splitlines(keepends=True)
     (run / "generations.jsonl").write_bytes(damage.join(lines[k] for k in kept))
@@ -438,6 +475,7 @@ def held_lines(run):
     return [line["index"] for line in records.read_generations(run)]
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("kept", [range(4), range(5), [0, 1, 2, 4, 5]])
 def test_lines_that_are_lost_take_the_state_before_them(tmp_path, kept):
     config, plan = at_generations(tmp_path / "run", 3, 6)
@@ -462,6 +500,7 @@ def test_damaged_lines_among_whole_ones_are_taken_out(tmp_path, damage):
     assert held_lines(tmp_path / "run") == list(range(6))
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("kept", [None, [], [1, 4, 5]])
 def test_without_a_state_that_has_its_lines_the_latest_goes_on_and_says_so(tmp_path, kept):
     config, plan = at_generations(tmp_path / "run", 3, 6)
@@ -564,6 +603,7 @@ attempt("close", states)
 """
 
 
+@pytest.mark.thorough
 def test_a_disk_that_is_really_full_ends_a_run_with_the_path_and_no_hang(tmp_path):
     """A limit on file sizes stands for the disk: the system refuses the writes of JAX's and Python's alike."""
     command = [sys.executable, "-c", FULL, str(tmp_path / "run")]

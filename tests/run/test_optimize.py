@@ -48,6 +48,7 @@ def contents(folder: Path) -> dict[str, bytes]:
     return found
 
 
+@pytest.mark.thorough
 def test_a_run_leaves_its_elites_best_first(finished):
     """With the volumes of their second evaluation, each with its promise, the initial candidate beside them."""
     volumes = []
@@ -87,6 +88,7 @@ def test_the_stored_configuration_is_the_runs(finished, small):
     assert configuration.load(finished / "config.yaml") == configuration.load(small.config)
 
 
+@pytest.mark.thorough
 def test_a_finished_run_says_so_and_is_left_as_it_is(finished, small):
     before = contents(finished) | {"page": (finished / "report.html").read_bytes()}
     code, output, errors = small.optimize(finished)
@@ -96,6 +98,7 @@ def test_a_finished_run_says_so_and_is_left_as_it_is(finished, small):
     assert contents(finished) | {"page": (finished / "report.html").read_bytes()} == before
 
 
+@pytest.mark.thorough
 def test_a_finished_run_without_its_page_gets_it_and_nothing_else(finished, small, tmp_path):
     folder = tmp_path / "whole"
     shutil.copytree(finished, folder, ignore=shutil.ignore_patterns("report.html", "figures"))
@@ -106,6 +109,7 @@ def test_a_finished_run_without_its_page_gets_it_and_nothing_else(finished, smal
     assert contents(folder) == contents(finished)
 
 
+@pytest.mark.thorough
 def test_another_configuration_is_refused_by_its_key(finished, small):
     before = contents(finished)
     code, _, errors = small.optimize(finished, "--search.sigma", "0.2")
@@ -116,6 +120,7 @@ def test_another_configuration_is_refused_by_its_key(finished, small):
     assert contents(finished) == before
 
 
+@pytest.mark.thorough
 def test_the_run_keeps_its_promise(finished, small):
     """Of the best and the initial candidate, before both independent simulators."""
     code, output, errors = small.call("verify", finished, "--states", "400")
@@ -138,6 +143,7 @@ def _kill_after(small: Small, folder: Path, generation: int, delay: float) -> in
     return process.returncode
 
 
+@pytest.mark.thorough
 def test_a_killed_run_ends_as_if_nothing_had_happened(finished, small, tmp_path):
     """Bit by bit: elites, initial candidate and generations."""
     folder = tmp_path / "killed"
@@ -153,6 +159,7 @@ LONG = "--elites.trials", "100000000", "--search.generations", "1"
 """Held-out samples for hours."""
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(("sent", "code"), [(signal.SIGTERM, Exit.PREEMPTED), (signal.SIGINT, Exit.INTERRUPTED)])
 def test_asked_to_stop_while_its_elites_are_sampled_again_a_run_ends_and_goes_on(small, tmp_path, sent, code):
     """While their program compiles or is at work. Both ask a start and its resume."""
@@ -168,6 +175,7 @@ def test_asked_to_stop_while_its_elites_are_sampled_again_a_run_ends_and_goes_on
     assert not (tmp_path / "run" / "elites").exists()
 
 
+@pytest.mark.thorough
 def test_asked_to_stop_while_it_compiles_a_run_ends_and_leaves_a_folder_that_goes_on(small, tmp_path):
     environment = small.environment | {"JAX_COMPILATION_CACHE_DIR": str(tmp_path)}
     command = [sys.executable, "-u", "-m", "rtcd_jax", "optimize", str(small.config), "--run", str(tmp_path / "run")]
@@ -261,6 +269,7 @@ def _run_with(monkeypatch, evaluate, folder):
         assert re.search(r"compiled  elapsed \d+:\d\d", screen.text)
 
 
+@pytest.mark.thorough
 def test_a_run_without_any_funnel_says_why(monkeypatch, tmp_path):
     with pytest.raises(UserError, match=f"none of {6 * GENERATIONS} candidates in {GENERATIONS} generations") as error:
         _run_with(monkeypatch, _failing, tmp_path / "run")
@@ -268,6 +277,7 @@ def test_a_run_without_any_funnel_says_why(monkeypatch, tmp_path):
     assert not (tmp_path / "run" / "elites").exists()
 
 
+@pytest.mark.thorough
 def test_elites_that_were_only_lucky_are_not_reported(monkeypatch, tmp_path):
     """Not one of them has a funnel when it is sampled again."""
     with pytest.raises(UserError, match="none of the elites kept a funnel under more samples"):

@@ -44,6 +44,7 @@ def _program():
     return lambda factor: jax.device_get(compare(jnp.asarray(factor)))
 
 
+@pytest.mark.thorough
 def test_the_robots_model_agrees_with_its_equations():
     """To rounding, on states of all knots: none fails by MJX."""
     found = _program()(1.0)
@@ -55,6 +56,7 @@ def test_the_robots_model_agrees_with_its_equations():
     assert line.startswith("MJX: 204 held-out samples of 2 funnels followed to the goal, 0 failed; largest")
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("factor", [1.01, 0.99, 1.0001])
 def test_a_wrong_mass_is_found_and_a_state_named(factor):
     found = _program()(factor)

@@ -104,6 +104,7 @@ def _on_four_devices(code: str) -> str:
     return process.stdout
 
 
+@pytest.mark.thorough
 def test_candidates_are_shared_out_over_devices_and_come_back_in_order():
     """Bit by bit, also where the devices do not divide the population or are more than it."""
     assert _on_four_devices(FAKE) == "equal\n"

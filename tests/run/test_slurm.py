@@ -56,6 +56,7 @@ def reached(folder: Path, generation: int) -> None:
         time.sleep(0.1)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("tasks", [pytest.param(1, marks=pytest.mark.slow), 2])
 def test_a_preempted_job_is_requeued_and_ends_with_the_same_bytes(cluster, whole, tmp_path, tasks):
     number = submitted(cluster, tmp_path, tasks, seconds=0.5)

@@ -35,6 +35,7 @@ def same(left, right):
     return all(np.array_equal(a, b, equal_nan=True) for a, b in pairs)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("seed", range(5))
 def test_sorted_apart_feasible_and_with_the_best_ever_seen(seed):
     populations = [random_population(100 * seed + k) for k in range(4)]
@@ -50,6 +51,7 @@ def test_sorted_apart_feasible_and_with_the_best_ever_seen(seed):
     assert archive.evaluation.volumes["sum"][0] == best
 
 
+@pytest.mark.thorough
 def test_whatever_is_left_out_is_worse_than_the_last_or_next_to_a_better_one():
     evaluation = random_population(3, size=200)
     archive = merged([evaluation])
@@ -63,6 +65,7 @@ def test_whatever_is_left_out_is_worse_than_the_last_or_next_to_a_better_one():
         assert better_neighbor or costs[k] >= archive.costs[-1]
 
 
+@pytest.mark.thorough
 def test_each_elite_is_its_whole_record():
     populations = [random_population(k) for k in range(3)]
     archive = merged(populations)
@@ -73,6 +76,7 @@ def test_each_elite_is_its_whole_record():
         assert same(pick, jax.tree.map(lambda leaf, i=row: leaf[i], source))
 
 
+@pytest.mark.thorough
 def test_without_neighbors_the_order_of_merges_does_not_matter():
     grid = np.stack(np.meshgrid(np.linspace(0, 1, 6), np.linspace(0, 1, 6)), -1).reshape(-1, 2)
     volumes = np.random.default_rng(0).permutation(36) + 1.0
@@ -91,6 +95,7 @@ def test_merging_twice_changes_nothing():
     assert np.all(once.generations == 4)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(("gap", "count"), [(0.0499, 1), (0.0501, 2)])
 def test_neighbors_are_merged_into_the_better_one_below_the_distance_and_not_above(gap, count):
     archive = merged([population([[0.5, 0.5], [0.5, 0.5 + gap]], [1.0, 2.0])])
@@ -98,6 +103,7 @@ def test_neighbors_are_merged_into_the_better_one_below_the_distance_and_not_abo
     assert archive.evaluation.volumes["sum"][0] == 2.0
 
 
+@pytest.mark.thorough
 def test_an_elite_is_replaced_by_its_better_neighbor_and_not_by_a_worse_one():
     old, better, worse = (population([[0.5, 0.5 + s]], [v]) for s, v in ((0.0, 2.0), (0.01, 3.0), (0.02, 1.0)))
     archive = merged([old, worse, better])
@@ -105,6 +111,7 @@ def test_an_elite_is_replaced_by_its_better_neighbor_and_not_by_a_worse_one():
     assert archive.generations[0] == 2
 
 
+@pytest.mark.thorough
 def test_distance_zero_keeps_all_but_is_no_license_for_duplicates_of_one_row():
     evaluation = population([[0.5, 0.5], [0.5, 0.5001]], [1.0, 2.0])
     archive = merged([evaluation], distance=0.0)
@@ -118,6 +125,7 @@ def test_a_failed_candidate_never_enters_however_large_its_volume(status):
     assert archive.evaluation.volumes["sum"][0] == 1.0
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("value", [0.0, -1.0, np.nan, np.inf])
 def test_a_volume_that_is_not_positive_and_finite_never_enters(value):
     archive = merged([population([[0.1, 0.1]], [value])])
@@ -145,6 +153,7 @@ def test_the_objective_decides_the_order():
     assert (by_sum[0], by_inlet[0]) == (2.0, 1.0)
 
 
+@pytest.mark.thorough
 def test_what_lacks_a_demanded_volume_ranks_behind_what_has_it_by_how_much_it_lacks():
     """Whatever the objective says of them: 8 and 2 lack push, 8 less of it; 20 and 40 do not, and 40 is the larger."""
     evaluation = population(np.linspace(0, 1, 5)[:, None] * np.ones(2), [8.0, 40.0, 2.0, 20.0, 90.0], [0, 0, 0, 0, 3])
@@ -180,6 +189,7 @@ def test_records_are_asked_for_only_where_one_enters():
         elites.merge(merged([worse]), Asked(better), BY_SUM, 1, DISTANCE)
 
 
+@pytest.mark.thorough
 def test_single_precision_evaluations_are_kept_as_they_are():
     evaluation = jax.tree.map(
         lambda leaf: leaf.astype(jnp.float32) if leaf.dtype == jnp.float64 else leaf, random_population(2)

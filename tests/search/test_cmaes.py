@@ -59,6 +59,7 @@ def same(left, right):
     return all(np.array_equal(a, b, equal_nan=True) for a, b in pairs)
 
 
+@pytest.mark.thorough
 def test_ellipsoid_needs_at_most_twice_the_evaluations_of_pycma():
     strategy = Strategy(10, 10, 0.3)
     _, (costs, *_) = runs(strategy, lambda x: ellipsoid(x, 0.6), 5, 800, jnp.full(10, 0.3))
@@ -99,6 +100,7 @@ def test_a_larger_population_solves_rastrigin_more_often():
     assert solved(8) <= 3
 
 
+@pytest.mark.thorough
 def test_restarts_find_what_one_search_misses():
     """Two wells; from this mean and step the search falls into the shallow one, whose floor it cannot leave."""
 
@@ -112,6 +114,7 @@ def test_restarts_find_what_one_search_misses():
     assert np.all(np.min(costs, axis=1) < 1e-8)
 
 
+@pytest.mark.thorough
 def test_the_first_population_has_the_mean_itself_as_its_first_member():
     strategy, mean = Strategy(3, 6, 0.3), jnp.array([0.0, 0.25, 1.0])
     state, points = ask(strategy, cmaes.start(strategy, mean), jax.random.key(1))
@@ -122,6 +125,7 @@ def test_the_first_population_has_the_mean_itself_as_its_first_member():
     assert not np.any(np.all(points == state.evolution.mean, axis=1))
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("failure", [jnp.inf, jnp.nan, -jnp.inf])
 def test_a_search_in_which_all_fails_stays_finite_near_the_box_and_starts_anew_elsewhere(failure):
     strategy = Strategy(3, 8, 0.3)
@@ -136,6 +140,7 @@ def test_a_search_in_which_all_fails_stays_finite_near_the_box_and_starts_anew_e
     assert np.all(spread > 0.1)
 
 
+@pytest.mark.thorough
 def test_failures_rank_last_whatever_their_number():
     """Tied ranks would give failed points the weights of good ones; only the feasible half may move the mean."""
     strategy, mean = Strategy(2, 16, 0.05), jnp.full(2, 0.5)
@@ -149,6 +154,7 @@ def test_failures_rank_last_whatever_their_number():
     assert same(tell(strategy, state, points, jnp.asarray(others)).evolution.mean, after.evolution.mean)
 
 
+@pytest.mark.thorough
 def test_tied_costs_take_every_weight_once():
     strategy = Strategy(4, 12, 0.3)
     begin = cmaes.start(strategy, jnp.full(4, 0.5))
@@ -160,6 +166,7 @@ def test_tied_costs_take_every_weight_once():
     assert same(flat.evolution, ordered.evolution)
 
 
+@pytest.mark.thorough
 def test_only_the_order_of_the_costs_matters_inside_the_box():
     strategy = Strategy(3, 8, 0.05)
     state, points = ask(strategy, cmaes.start(strategy, jnp.full(3, 0.5)), jax.random.key(0))
@@ -176,6 +183,7 @@ def test_a_point_outside_the_box_loses_against_its_equal_inside():
     assert after.evolution.mean[0] < 1
 
 
+@pytest.mark.thorough
 def test_vmapped_equals_looped():
     strategy, mean, cost = Strategy(3, 8, 0.3), jnp.full(3, 0.4), rastrigin
     batched, (costs, *_) = runs(strategy, cost, 3, 25, mean)
@@ -185,6 +193,7 @@ def test_vmapped_equals_looped():
         np.testing.assert_allclose(batched.evolution.C[lane], single.evolution.C, rtol=1e-9, atol=1e-12)
 
 
+@pytest.mark.thorough
 def test_a_lane_that_only_fails_leaves_its_neighbours_bit_equal():
     strategy = Strategy(2, 8, 0.3)
     keys = jax.random.split(jax.random.key(5), 20)
@@ -201,6 +210,7 @@ def test_a_lane_that_only_fails_leaves_its_neighbours_bit_equal():
     assert same(lane(healthy), lane(mixed))
 
 
+@pytest.mark.thorough
 def test_the_carry_keeps_its_types_and_a_stored_state_goes_on_bit_equal():
     strategy = Strategy(3, 8, 0.3)
     begin = cmaes.start(strategy, jnp.full(3, 0.4))
@@ -232,6 +242,7 @@ def after_one(strategy):
 S = Strategy(2, 8, 0.3)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("reason", "below", "above"),
     [
@@ -274,6 +285,7 @@ def test_one_feasible_generation_within_the_memory_keeps_a_search_alive():
     assert cmaes.stop(strategy, state) == Stop.NOTHING_FEASIBLE
 
 
+@pytest.mark.thorough
 def test_restart_touches_only_the_lanes_that_stopped():
     alive = after_one(S)
     dead = with_evolution(alive, std=jnp.asarray(jnp.nan))
@@ -301,6 +313,7 @@ def test_a_strategy_refuses_what_cannot_work(arguments, message):
         Strategy(*arguments)
 
 
+@pytest.mark.thorough
 def test_one_variable_and_the_smallest_population_work():
     _, (costs, *_) = run(Strategy(1, 4, 0.3), lambda x: (x[:, 0] - 0.7) ** 2, jax.random.key(0), 60, jnp.zeros(1))
     assert np.min(costs) < 1e-8

@@ -48,6 +48,7 @@ def fails(status):
 both_modes = pytest.mark.parametrize("mode", ["joint", "nested"])
 
 
+@pytest.mark.thorough
 @both_modes
 def test_the_search_finds_the_known_optimum(mode):
     final, last = all_of(plan(mode, generations=60))[-1]
@@ -55,6 +56,7 @@ def test_the_search_finds_the_known_optimum(mode):
     np.testing.assert_allclose(final.elites.evaluation.genome[0], PEAK, atol=0.08)
 
 
+@pytest.mark.thorough
 @both_modes
 @pytest.mark.parametrize("failed", [Status.FUNNEL_EMPTY, Status.TOO_STIFF])
 def test_what_bears_more_knots_ranks_better_where_nothing_is_feasible(mode, failed):
@@ -72,6 +74,7 @@ def test_what_bears_more_knots_ranks_better_where_nothing_is_feasible(mode, fail
     assert searched[-1].best_so_far > 0.9
 
 
+@pytest.mark.thorough
 @both_modes
 def test_the_initial_genome_is_the_first_that_is_evaluated(mode):
     _, first = all_of(plan(mode, generations=1))[0]
@@ -120,6 +123,7 @@ def test_the_seed_decides_everything_and_each_generation_has_its_own_directions(
     assert len(set(keys)) == 10
 
 
+@pytest.mark.thorough
 @both_modes
 def test_every_genome_is_in_the_box_even_when_the_optimum_is_not(mode):
     for _, generation in all_of(plan(mode, initial=(1.0, 0.0, 1.0), sigma=0.9)):
@@ -141,6 +145,7 @@ def test_nested_candidates_of_one_design_share_it_and_differ_in_their_weights():
         np.testing.assert_array_equal(generations[k][:, 0, 1:], np.tile(INITIAL[1:], (4, 1)))
 
 
+@pytest.mark.thorough
 def test_the_outer_search_is_told_the_best_of_each_inner_search():
     """Rebuilt by hand with `cmaes` alone from the recorded costs."""
     chosen = plan("nested", generations=3)
@@ -157,6 +162,7 @@ def test_the_outer_search_is_told_the_best_of_each_inner_search():
     assert final.outer.evolution.generation_counter == 1
 
 
+@pytest.mark.thorough
 def test_nested_searches_equal_looped_ones():
     """The inner search of one design, run alone on that design's recorded costs, asks for the same weights."""
     loop = Nested.plan(32, 4, 3, 0.3, INITIAL, DESIGN)
@@ -173,12 +179,14 @@ def test_nested_searches_equal_looped_ones():
         np.testing.assert_allclose(after.inner.evolution.C[design], alone.evolution.C, rtol=1e-9)
 
 
+@pytest.mark.thorough
 def test_pinned_variables_are_not_in_the_genome_and_one_free_weight_is_enough():
     _, last = all_of(plan(initial=(0.1,), design=(False,)))[-1]
     assert last.genomes.shape == (32, 1)
     assert last.best_so_far > 99.9
 
 
+@pytest.mark.thorough
 def test_the_record_agrees_with_the_evaluation():
     seen = []
 
@@ -216,6 +224,7 @@ def test_sigma_is_the_spread_of_the_population_however_the_covariance_is_scaled(
     assert 0.3 < records[-2].sigma / spread < 3
 
 
+@pytest.mark.thorough
 @both_modes
 def test_a_search_that_gains_nothing_ends_after_its_patience(mode):
     """Nothing is gained from the first generation on; nested, generations of the outer search count."""
@@ -287,6 +296,7 @@ def test_one_feasible_candidate_keeps_the_search_going():
     assert len(all_of(plan(generations=12), rare)) == 12
 
 
+@pytest.mark.thorough
 def test_finish_reports_the_second_evaluation_alone_and_sorts_anew():
     final, _ = all_of(plan(distance=0.05))[-1]
     assert final.elites.count == 4
@@ -297,6 +307,7 @@ def test_finish_reports_the_second_evaluation_alone_and_sorts_anew():
     np.testing.assert_array_equal(finished.generations, final.elites.generations[jnp.array([1, 3, 2, 0])])
 
 
+@pytest.mark.thorough
 def test_finish_drops_elites_that_fail_the_second_time_and_never_fills_empty_slots():
     def only_three(genomes, key):
         statuses = jnp.where(jnp.arange(len(genomes)) < 3, Status.OK, Status.FUNNEL_EMPTY)

@@ -61,6 +61,7 @@ def finished_by_one(path, devices):
     return int(re.search(r"^from (\d+)$", output, re.MULTILINE).group(1))
 
 
+@pytest.mark.thorough
 def test_two_processes_end_with_the_bytes_of_one(tmp_path, whole):
     outputs = [end(process) for process in start(tmp_path / "run")]
     assert all(output.endswith("done\n") for output in outputs), outputs
@@ -78,6 +79,7 @@ def test_mpirun_tells_its_processes_by_itself(tmp_path, whole):
     assert results(tmp_path / "run") == whole
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("victim", [pytest.param(0, marks=pytest.mark.slow), 1])
 def test_if_one_is_killed_the_other_ends_soon_and_the_run_goes_on_exactly(tmp_path, whole, victim):
     """Process 0 holds the others together: without it they may be ended by JAX's runtime itself."""
@@ -94,6 +96,7 @@ def test_if_one_is_killed_the_other_ends_soon_and_the_run_goes_on_exactly(tmp_pa
     assert results(tmp_path / "run") == whole
 
 
+@pytest.mark.thorough
 def test_if_one_ends_while_a_state_is_saved_it_is_a_lost_process_and_no_damaged_disk(tmp_path):
     processes = start(tmp_path / "run", SLOWLY, last_saves=(0, 3))
     output = end(processes[0])
@@ -102,6 +105,7 @@ def test_if_one_ends_while_a_state_is_saved_it_is_a_lost_process_and_no_damaged_
     assert "lost another process of this run" in output
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("devices", [pytest.param(1, marks=pytest.mark.slow), 4])
 def test_asked_to_stop_both_save_and_leave_and_one_process_goes_on_exactly(tmp_path, whole, devices):
     """On one device, or on four."""

@@ -153,6 +153,7 @@ def test_nothing_is_told_where_something_else_is_or_nothing_compiles():
     assert not told.getvalue()
 
 
+@pytest.mark.thorough
 def test_the_banner_is_awaited_as_long_as_a_program_compiles(capfd):
     """What stands at descriptor 2 is another file then, and the same one before and behind."""
 

@@ -69,6 +69,7 @@ def test_gpus_are_those_that_slurm_gave(environment, given):
     assert gpus_given(environment) == given
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("environment", "code", "text"),
     [
@@ -87,6 +88,7 @@ def test_a_cpu_is_no_substitute_for_the_gpus_of_a_job(tmp_path, environment, cod
     assert done.stderr.startswith(text)
 
 
+@pytest.mark.thorough
 def test_programs_are_kept_in_the_users_cache_unless_told_otherwise(tmp_path):
     home = {"XDG_CACHE_HOME": str(tmp_path / "xdg")}
     shown = python(SHOW.format(""), **home)

@@ -59,6 +59,7 @@ def test_without_an_initial_funnel_the_best_is_shown_alone(tmp_path, backend):
         assert gif.size == (animate.SIDE // 2, animate.SIDE + animate.GAP // 2)
 
 
+@pytest.mark.thorough
 def test_progress_is_drawn_on_a_terminal(tmp_path, backend):
     """Three frames a second of a short motion, in a process of its own."""
     code = (

@@ -50,6 +50,7 @@ def disturbed(small, tmp_path_factory):
     return folder, screen.text, {name: (folder / "disturbance" / f"{name}.json").read_bytes() for name in NAMES}
 
 
+@pytest.mark.thorough
 def test_every_experiment_leaves_its_record_and_its_figures(disturbed):
     folder, text, records = disturbed
     for name, content in records.items():
@@ -74,6 +75,7 @@ def test_every_experiment_leaves_its_record_and_its_figures(disturbed):
         assert words in text
 
 
+@pytest.mark.thorough
 def test_a_push_inside_the_funnel_is_recovered_from_and_one_that_only_a_false_level_contains_is_not(pendulums):
     """The margin is never above what is tolerated; with levels that are far too large it is, and 0 is tolerated."""
     false = dataclasses.replace(pendulums.elites[1], rho=900 * pendulums.elites[1].rho)
@@ -93,6 +95,7 @@ def test_a_push_inside_the_funnel_is_recovered_from_and_one_that_only_a_false_le
     assert record["summary"]["best"]["tolerated_at_all_times"] == 0
 
 
+@pytest.mark.thorough
 def test_the_same_seed_gives_the_same_records_and_another_one_others(disturbed, tmp_path):
     folder, _, records = disturbed
     copy = shutil.copytree(folder, tmp_path / "copy")
@@ -105,6 +108,7 @@ def test_the_same_seed_gives_the_same_records_and_another_one_others(disturbed, 
     assert read["factors"] == [1, 4]
 
 
+@pytest.mark.thorough
 def test_verdicts_are_the_verifications(tmp_path):
     """Uniform states of the first ellipsoid, and others twelve times as far: arrived or not, state by state."""
     folder = run_folder(tmp_path / "run", "pendulum")

@@ -120,6 +120,7 @@ def test_every_trouble_changes_what_it_names_and_nothing_else(robots):
     assert set(robots.plant.design_units) < set(names)
 
 
+@pytest.mark.thorough
 def test_a_hold_is_so_many_periods_of_the_loop_s_own_export(robots):
     """To whole steps of the simulation, one at least."""
     (hold,) = (perturbation for perturbation in perturbations(robots) if perturbation.name == "hold")
@@ -136,6 +137,7 @@ def test_rates_and_delays_are_whole_steps(robots):
         np.testing.assert_allclose(seconds / STEP, np.round(seconds / STEP), atol=1e-9, err_msg=name)
 
 
+@pytest.mark.thorough
 def test_the_score_is_the_mean_of_six_criteria(robots):
     """Those with a wrong model all fail: the best loop's others succeed, of the initial one's half."""
 

@@ -20,6 +20,7 @@ def run(tmp_path):
     return finished(tmp_path / "run")
 
 
+@pytest.mark.thorough
 def test_the_files_are_whole_images(run):
     paths = draw_figures(read_run(run))
     for path in paths[::2]:
@@ -31,6 +32,7 @@ def test_the_files_are_whole_images(run):
         assert path.read_bytes().rstrip().endswith(b"%%EOF")
 
 
+@pytest.mark.thorough
 def test_the_same_run_gives_the_same_bytes_whatever_the_user_s_style_which_is_left_as_it_was(run):
     before = [path.read_bytes() for path in draw_funnels(read_run(run))]
     with matplotlib.rc_context({"font.size": 20, "axes.facecolor": "red", "figure.dpi": 30}):
@@ -39,6 +41,7 @@ def test_the_same_run_gives_the_same_bytes_whatever_the_user_s_style_which_is_le
         assert dict(matplotlib.rcParams) == mine
 
 
+@pytest.mark.thorough
 def test_a_report_needs_neither_jax_nor_a_display(run):
     script = (
         "import sys; from pathlib import Path; from rtcd_jax.analysis.report import report\n"

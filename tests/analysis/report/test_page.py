@@ -373,6 +373,7 @@ def test_one_run_gets_its_page_and_figures_several_get_one_beside_them(tmp_path,
     ]
 
 
+@pytest.mark.thorough
 def test_a_report_asked_for_in_a_notebook_s_shell_is_drawn_into_files(tmp_path):
     """Jupyter names a backend that only its own environment has, here one that ours has not."""
     run = finished(tmp_path / "run")
@@ -382,6 +383,7 @@ def test_a_report_asked_for_in_a_notebook_s_shell_is_drawn_into_files(tmp_path):
     assert (run / "figures" / "overlay.png").is_file()
 
 
+@pytest.mark.thorough
 def test_a_page_that_cannot_be_written_is_refused(tmp_path, figures):
     run = finished(tmp_path / "run")
     with pytest.raises(UserError, match=r"--to = .*: must be a file, and this is a folder"):
@@ -391,6 +393,7 @@ def test_a_page_that_cannot_be_written_is_refused(tmp_path, figures):
         report([run])
 
 
+@pytest.mark.thorough
 def test_a_run_that_has_lost_its_generations_has_a_page_without_them(tmp_path):
     config = experiment()
     lost = run_folder(tmp_path / "lost", config, candidate(config), candidate(config, 1), generations=[])

@@ -35,6 +35,7 @@ def run(certified, tmp_path):
     return shutil.copytree(certified, tmp_path / "run")
 
 
+@pytest.mark.thorough
 def test_what_the_checker_accepts_is_proved(run):
     text = render([read_run(run)])
     (row,) = rows(tables.certificates([read_run(run)]))

@@ -66,6 +66,7 @@ def test_efficiency_is_one_where_the_rate_grows_with_the_devices():
     assert efficiencies(rows) == {(64, 1): 1.0, (64, 2): 1.0, (64, 4): 0.5}
 
 
+@pytest.mark.thorough
 def test_a_study_leaves_points_table_and_figures_and_goes_on_where_it_stopped(tmp_path, monkeypatch):
     config = parse_yaml(EXAMPLE)
     asked = answering(monkeypatch, measured)
@@ -86,6 +87,7 @@ def test_a_study_leaves_points_table_and_figures_and_goes_on_where_it_stopped(tm
     assert asked[4:] == [(32, 1)]
 
 
+@pytest.mark.thorough
 def test_a_line_that_a_kill_has_torn_costs_its_point_alone(tmp_path, monkeypatch):
     config = parse_yaml(EXAMPLE)
     asked = answering(monkeypatch, measured)

@@ -53,6 +53,7 @@ def test_the_largest_proved_box_has_its_certificate(run, monkeypatch):
     assert not list((run / "tolerance").glob(".*"))
 
 
+@pytest.mark.thorough
 def test_nothing_above_what_means_something_is_tried(run):
     row = found(run, most=0.5)
     assert (row["factor"], row["at_most"], row["guarantee"]) == (0.5, True, "proved")

@@ -36,6 +36,7 @@ def test_what_has_no_funnel_even_without_uncertainty_bears_nothing():
     assert largest_factors(lambda factors: factors < 0, np.array([np.inf])).tolist() == [0.0]
 
 
+@pytest.mark.thorough
 def test_a_disturbance_is_borne_up_to_the_known_one():
     """x' = -x + w within |x| <= LIMIT bears |w| <= LIMIT, all at once in one program."""
     box = uncertainty(residual=0.999, noise=(0.0,), input=LIMIT / 2)

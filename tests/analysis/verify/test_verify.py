@@ -286,6 +286,7 @@ def test_verify_run_reports_an_initial_candidate_without_a_funnel(tmp_path):
     assert not (tmp_path / "verification" / "initial.json").exists()
 
 
+@pytest.mark.thorough
 def test_chunks_do_not_change_a_verdict(monkeypatch):
     elite = _held(10 * HELD)
     whole = verified(elite, states=50).outcomes["RK45"]
@@ -296,6 +297,7 @@ def test_chunks_do_not_change_a_verdict(monkeypatch):
         np.testing.assert_array_equal(getattr(parts, kind), getattr(whole, kind))
 
 
+@pytest.mark.thorough
 def test_a_stopped_verification_goes_on_and_ends_with_the_same_files(tmp_path, monkeypatch):
     monkeypatch.setattr("rtcd_jax.analysis.verify.verification.CHUNK", 20)
     for name in ("whole", "stopped"):
@@ -316,6 +318,7 @@ def test_a_stopped_verification_goes_on_and_ends_with_the_same_files(tmp_path, m
     assert sorted(path.name for path in (folder / "verification").iterdir()) == ["000.json", "initial.json"]
 
 
+@pytest.mark.thorough
 def test_chunks_of_a_funnel_that_has_changed_are_simulated_again(tmp_path, monkeypatch):
     monkeypatch.setattr("rtcd_jax.analysis.verify.verification.CHUNK", 20)
     _store(tmp_path / "elites", "000", _held(10 * HELD))
@@ -329,6 +332,7 @@ def test_chunks_of_a_funnel_that_has_changed_are_simulated_again(tmp_path, monke
     assert "6/12 chunks" not in screen.text
 
 
+@pytest.mark.thorough
 def test_the_number_of_processes_changes_nothing(tmp_path):
     _store(tmp_path / "elites", "000", _held(10 * HELD))
     _store(tmp_path, "initial", _held(HELD))
@@ -339,6 +343,7 @@ def test_the_number_of_processes_changes_nothing(tmp_path):
     assert found[0] == found[1]
 
 
+@pytest.mark.thorough
 def test_the_same_seed_gives_the_same_states():
     first, again, other = (verified(_held(HELD), states=6, seed=seed).states for seed in (1, 1, 2))
     np.testing.assert_array_equal(first, again)
