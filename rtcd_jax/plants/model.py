@@ -22,8 +22,8 @@ from rtcd_jax.system.errors import UserError
 
 CAMERA = "front"
 """What `animate` looks through. A model without it is given one that sees its motion."""
-LEAST_INERTIA = 1e-15
-"""What MuJoCo wants of a point mass, its mjMINVAL [kg m^2]; a palm-sized robot has 1e-5."""
+LEAST_INERTIA = 1e-14
+"""What MuJoCo wants of a point mass, with a margin [kg m^2]; a palm-sized robot has 1e-5."""
 
 _OBJECTS = {
     "body": mujoco.mjtObj.mjOBJ_BODY,

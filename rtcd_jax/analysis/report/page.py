@@ -139,8 +139,7 @@ def _header(runs: Sequence[Run]) -> str:
         candidate = f'<p class="candidate">best: {html.escape(tables.candidate(runs[0]))}</p>'
     else:
         cards = "".join(
-            _card(run.name, f"× {four_digits(_gain(run, 'sum'))}", f"sum over its initial one, {run.best.guarantee}")
-            for run in runs
+            _card(f"{run.name}: {name}", value, remark) for run in runs for name, value, remark in [_gained(run, "sum")]
         )
         candidate = ""
     names = " · ".join(html.escape(run.name) for run in runs)
@@ -152,8 +151,8 @@ def _headlines(run: Run) -> Iterator[tuple[str, str, str]]:
     """Name, value and remark of what is looked for first."""
     objective = run.config.search.objective
     for name in dict.fromkeys((objective, "sum", "inlet")):
-        searched = ", searched" if name == objective else ""
-        yield f"{words(name)} over initial", f"× {four_digits(_gain(run, name))}", run.best.guarantee + searched
+        of_the_best, value, remark = _gained(run, name)
+        yield of_the_best, value, f"{remark}, searched" if name == objective else remark
     yield "swing-up", duration(float(run.best.time[-1])), "of the best, start to goal"
     certificate = run.certificates.get("000")
     if certificate is None:
@@ -166,8 +165,13 @@ def _headlines(run: Run) -> Iterator[tuple[str, str, str]]:
     yield "verification", verdict or "none yet", "by independent simulators" if verdict else "rtcd verify"
 
 
-def _gain(run: Run, volume: str) -> float | None:
-    return ratio(run.best.volumes[volume], run.initial.volumes[volume]) if run.initial else None
+def _gained(run: Run, volume: str) -> tuple[str, str, str]:
+    """A volume of the best over the initial candidate's; by itself where that one has no funnel."""
+    gain = ratio(run.best.volumes[volume], run.initial.volumes[volume]) if run.initial else None
+    if gain is None:
+        value = f"{four_digits(run.best.volumes[volume])} {volume_unit(run.config, volume)}"
+        return words(volume), value, f"{run.best.guarantee}; initially none"
+    return f"{words(volume)} over initial", f"× {four_digits(gain)}", run.best.guarantee
 
 
 def _card(name: str, value: str, remark: str) -> str:
