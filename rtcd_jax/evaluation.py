@@ -22,15 +22,16 @@ from rtcd_jax.policy import input_jumps, stabilize
 from rtcd_jax.problem import Problem
 from rtcd_jax.system.devices import path_batch
 from rtcd_jax.trajectory import plan
-from rtcd_jax.types import Candidate, Evaluation, Policy
+from rtcd_jax.types import Candidate, Evaluation, Policy, Status, TaskEvaluations, Volumes
 from rtcd_jax.validation import Dynamics, PhysicsComparison, Rollouts, SamplingBudget, compare_physics
-from rtcd_jax.volume import funnel_volume
+from rtcd_jax.volume import OVER_TASKS, funnel_volume
 
 TEMPORARIES = 16
 """Memory of a candidate on a GPU over that of its held-out samples, as counted by launch/bench/gpu_budget.py."""
 MOST_ON_A_CPU = 512
 
-Evaluate = Callable[[Float[Array, "P d"], PRNGKeyArray], Evaluation]
+Evaluate = Callable[[Float[Array, "P d"], PRNGKeyArray], Evaluation | TaskEvaluations]
+Budget = Callable[[Problem], SamplingBudget]
 
 FIRST_SAMPLES = 2000
 """Held-out samples a knot, at most, of the first, cheap rounds of the elites, and of those under further keys."""
@@ -75,26 +76,51 @@ def elite_key() -> PRNGKeyArray:
     return jax.random.key(1 << 32)
 
 
-def make_evaluate(problem: Problem, budget: SamplingBudget | None = None) -> Evaluate:
+def make_evaluate(problem: Problem, budget: Budget = search_budget) -> Evaluate:
     """`evaluate(genomes [P d], key) -> Evaluation [P]`, to be jitted; all candidates share the key's random numbers.
 
-    Without a `budget` that of a generation is made.
+    Of several tasks it is TaskEvaluations: one program evaluates the P T candidates.
     """
-    budget = budget or search_budget(problem)
 
-    def evaluate(genomes: Float[Array, "P d"], key: PRNGKeyArray) -> Evaluation:
-        candidates = jax.vmap(partial(decode, problem))(genomes)
+    def evaluate(genomes: Float[Array, "P d"], candidates: Candidate, key: PRNGKeyArray) -> Evaluation:
         trajectories = plan(problem, candidates)
         count = genomes.shape[0]
         batch = count if on_gpu() else batch_in_cache(problem, count)
-        policies = in_batches(lambda pair: stabilize(problem, *pair), (candidates, trajectories), batch)
+
+        def stabilized(pair):
+            return stabilize(problem.of(pair[0]), *pair)
+
+        def stiffness(candidate, policy):
+            return rollout.stiffness(problem.of(candidate), candidate, policy, budget(problem).funnel)
+
+        policies = in_batches(stabilized, (candidates, trajectories), batch)
         # A batch takes the steps that its stiffest candidate needs.
-        stiffness = jax.vmap(lambda *pair: rollout.stiffness(problem, pair[0], pair[1], budget.funnel))
-        order = jnp.argsort(stiffness(candidates, policies).parts)
+        order = jnp.argsort(jax.vmap(stiffness)(candidates, policies).parts)
         assess = lambda one: _with_funnel(problem, budget, key, *one)  # noqa: E731
         return in_batches(assess, (genomes, candidates, policies), batch, order)
 
-    return evaluate
+    def of_the_task(genomes: Float[Array, "P d"], key: PRNGKeyArray) -> Evaluation:
+        return evaluate(genomes, jax.vmap(partial(decode, problem))(genomes), key)
+
+    def of_all_tasks(genomes: Float[Array, "P d"], key: PRNGKeyArray) -> TaskEvaluations:
+        count, tasks = genomes.shape[0], len(problem.tasks)
+        each = jnp.repeat(genomes, tasks, axis=0)
+        candidates = jax.vmap(partial(decode, problem))(each, jnp.tile(jnp.arange(tasks), count))
+        flat = evaluate(each, candidates, key)
+        each_task = jax.tree.map(lambda leaf: leaf.reshape(count, tasks, *leaf.shape[1:]), flat)
+        return over_tasks(each_task, problem.config.search.over_tasks)
+
+    return of_all_tasks if problem.tasks else of_the_task
+
+
+def over_tasks(tasks: Evaluation, how: str) -> TaskEvaluations:
+    """What a search makes of the evaluations [... T] of each genome on every task; `how` is one of `OVER_TASKS`."""
+    status = tasks.status
+    reduce = OVER_TASKS[how]
+    named = {name: reduce(tasks.volumes[name]) for name in tasks.volumes.named}
+    first = jnp.take_along_axis(status, jnp.argmax(status != Status.OK, -1)[..., None], -1)[..., 0]
+    per_knot = reduce(jnp.moveaxis(tasks.volumes.per_knot, -2, -1))
+    return TaskEvaluations(tasks.genome[..., 0, :], tasks, Volumes(per_knot, named), first)
 
 
 def batch_in_cache(problem: Problem, count: int) -> int:
@@ -117,6 +143,7 @@ def device_chunk(problem: Problem, share: int, memory: float) -> int:
     if chunk == "auto":
         fit = int(0.8 * memory / (TEMPORARIES * _bytes_of_states(problem))) // VECTOR * VECTOR
         chunk = max(VECTOR, fit if on_gpu() else min(fit, MOST_ON_A_CPU))
+        chunk = max(1, chunk // max(1, len(problem.tasks)))
     return min(chunk, share)
 
 
@@ -141,7 +168,7 @@ def _take(tree: PyTree, rows: Int[Array | np.ndarray, " E"]) -> PyTree:
 
 def resample(
     problem: Problem,
-    budget: SamplingBudget,
+    budget: Budget,
     evaluation: Evaluation,
     key: PRNGKeyArray,
     samples_per_knot: Int[Array, ""] | int | None = None,
@@ -153,20 +180,21 @@ def resample(
 
 def compare_with_mjx(problem: Problem, evaluation: Evaluation, key: PRNGKeyArray) -> PhysicsComparison:
     """`elites.mjx_states` held-out samples of one candidate's funnel, followed to the goal by both physics."""
-    funnel, config = evaluation.funnel, problem.config
+    funnel, config, problem = evaluation.funnel, problem.config, problem.of(evaluation.candidate)
     rollouts = Rollouts.of(problem, evaluation.candidate, funnel.policy, config.funnel)
     return compare_physics(rollouts, funnel.levels, key, config.elites.mjx_states)
 
 
 def _with_funnel(
     problem: Problem,
-    budget: SamplingBudget,
+    budget: Budget,
     key: PRNGKeyArray,
     genome: Float[Array, " d"],
     candidate: Candidate,
     policy: Policy,
     samples_per_knot: Int[Array, ""] | int | None = None,
 ) -> Evaluation:
-    funnel = estimate_funnel(problem, candidate, policy, key, budget, samples_per_knot)
+    problem = problem.of(candidate)
+    funnel = estimate_funnel(problem, candidate, policy, key, budget(problem), samples_per_knot)
     volumes = funnel_volume(funnel, input_jumps(problem, candidate, policy.trajectory))
     return Evaluation(genome, candidate, funnel, volumes, funnel.status)

@@ -7,16 +7,21 @@ variables have no dimension.
 from collections.abc import Sequence
 from math import log
 
+import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from rtcd_jax.problem import Problem, Variable
 from rtcd_jax.types import Candidate
 
 
-def decode(problem: Problem, genome: Float[Array, " d"]) -> Candidate:
-    """The candidate that a genome stands for; entries outside [0, 1] leave the box."""
+def decode(problem: Problem, genome: Float[Array, " d"], task: Int[Array, ""] | None = None) -> Candidate:
+    """The candidate that a genome stands for; entries outside [0, 1] leave the box.
+
+    Of several tasks it is asked for the one of this number, with that one's design.
+    """
     values, dimension = {}, 0
     for variable in problem.variables:
         if variable.free:
@@ -29,11 +34,22 @@ def decode(problem: Problem, genome: Float[Array, " d"]) -> Candidate:
         return [value for name, value in values.items() if name.startswith(prefix)]
 
     return Candidate(
-        design=problem.plant.Design(*section("design.")),
+        design=_edited(problem, problem.plant.Design(*section("design.")), task),
         q=jnp.stack(section("weights.q.")),
         r=jnp.stack(section("weights.r.")),
         policy={name.removeprefix("policy."): value for name, value in values.items() if name.startswith("policy.")},
+        task=task,
     )
+
+
+def _edited(problem: Problem, design: eqx.Module, task: Int[Array, ""] | None) -> eqx.Module:
+    """The design as the task has it; that of several tasks in common where none of them is meant."""
+    if not problem.tasks:
+        return problem.edited(design)
+    if task is None:
+        return design
+    each = [alone.edited(design) for alone in problem.tasks]
+    return jax.tree.map(lambda *leaves: jnp.stack(leaves)[task], *each)
 
 
 def encode(problem: Problem, values: Sequence[float]) -> Float[np.ndarray, " d"]:

@@ -1,6 +1,7 @@
 """What stays fixed during a run: the robot, the task, the time grid, the searched variables."""
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 
 import equinox as eqx
 import jax
@@ -9,12 +10,13 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from rtcd_jax.config.load import Config
+from rtcd_jax.config.robot import value_of
 from rtcd_jax.plants import make_plant
 from rtcd_jax.plants.base import Plant
 from rtcd_jax.system.devices import require_float64
 from rtcd_jax.system.errors import ConfigError
 from rtcd_jax.system.errors import Problem as Fault
-from rtcd_jax.types import Uncertainty
+from rtcd_jax.types import Candidate, Uncertainty
 
 AT_REST = 1e-6
 """Largest rate of a goal [state/s]: one typed with 16 digits leaves the rounding of pi times the stiffness."""
@@ -52,12 +54,14 @@ class Problem:
 
     config: Config
     plant: Plant
-    start: Float[np.ndarray, " n"]
-    goal: Float[np.ndarray, " n"]
+    start: Float[Array | np.ndarray, "n *batch"]
+    goal: Float[Array | np.ndarray, "n *batch"]
     state_limits: Float[np.ndarray, " n"]
     variables: tuple[Variable, ...]
     uncertainty: Uncertainty | None = None
     """What the funnels must bear; None for one exact model."""
+    tasks: tuple["Problem", ...] = ()
+    """Where there are several: each alone. Start, goal and the robot's constants are then the first one's."""
 
     @property
     def intervals(self) -> int:
@@ -69,6 +73,33 @@ class Problem:
         if all(isinstance(limit, int | float) for limit in limits):
             return np.array(limits, float)
         return jnp.stack(jnp.broadcast_arrays(*map(jnp.asarray, limits)))
+
+    def of(self, candidate: Candidate) -> "Problem":
+        """The problem as this candidate has it: with several tasks, start, goal and robot are those of its own task,
+        arrays that a compiled program reads out of tables by the task's number.
+        """
+        if not self.tasks:
+            return self
+
+        def own(numbers: Callable[[Problem], Array | np.ndarray]) -> Array:
+            table = jnp.asarray(np.stack([np.asarray(numbers(each)) for each in self.tasks]))
+            return jnp.moveaxis(table[candidate.task], -1, 0)
+
+        first, *others = (vars(each.plant) for each in self.tasks)
+        names = [name for name in first if any(other[name] != first[name] for other in others)]
+        plant = self.plant
+        if names:
+            table = own(lambda each: np.array([getattr(each.plant, name) for name in names]))
+            plant = eqx.tree_at(lambda plant: [getattr(plant, name) for name in names], plant, [*table])
+        return replace(self, plant=plant, start=own(lambda each: each.start), goal=own(lambda each: each.goal))
+
+    def edited(self, design: eqx.Module) -> eqx.Module:
+        """The design as the configuration's one task changes it."""
+        if not self.config.design_edits:
+            return design
+        names = vars(self.plant) | vars(design)
+        edits = {name: jnp.asarray(value_of(value, names)) for name, value in self.config.design_edits.items()}
+        return type(design)(**(vars(design) | edits))
 
     @property
     def free(self) -> tuple[Variable, ...]:
@@ -85,10 +116,18 @@ def make_problem(config: Config) -> Problem:
 
     Raises:
         UserError: if JAX computes in float32.
-        ConfigError: if the goal is no equilibrium of the initial design without input, or cannot be stabilized there.
+        ConfigError: if a goal is no equilibrium of the initial design without input, or cannot be stabilized there.
         UserError: if the robot's MJCF does not move as its equations say, at random states, inputs and designs.
     """
     require_float64()
+    if len(config.tasks) <= 1:
+        (alone,) = config.each.values()
+        return _make_problem(alone, ("task",))
+    tasks = tuple(_make_problem(alone, ("tasks", name)) for name, alone in config.each.items())
+    return replace(tasks[0], config=config, tasks=tasks)
+
+
+def _make_problem(config: Config, path: tuple[str, ...]) -> Problem:
     plant = make_plant(config.plant, config.design_units)
     problem = Problem(
         config=config,
@@ -99,8 +138,8 @@ def make_problem(config: Config) -> Problem:
         variables=tuple(_variables(config)),
         uncertainty=_uncertainty(config),
     )
-    _require_equilibrium(problem)
-    _require_stabilizable(problem)
+    _require_equilibrium(problem, path)
+    _require_stabilizable(problem, path)
     _require_agreement(problem)
     return problem
 
@@ -159,36 +198,34 @@ def _uncertainty(config: Config) -> Uncertainty | None:
     )
 
 
-def _require_equilibrium(problem: Problem) -> None:
+def _require_equilibrium(problem: Problem, path: tuple[str, ...]) -> None:
     plant, initial = problem.plant, initial_design(problem)
     dynamics = jax.jit(plant.dynamics)
 
     def rates(state: np.ndarray) -> np.ndarray:
         return np.asarray(dynamics(initial, jnp.asarray(state), jnp.zeros(plant.m)))
 
-    found = rates(problem.goal)
+    goal = np.asarray(problem.goal)
+    found = rates(goal)
     if np.max(np.abs(found)) <= AT_REST:
         return
-    quarters = np.round(problem.goal / (np.pi / 2))
+    quarters = np.round(goal / (np.pi / 2))
     turns = quarters * np.pi / 2
     near = [
         unit == "rad" and abs(turn - value) < NEAR
-        for unit, turn, value in zip(plant.state_units, turns, problem.goal, strict=True)
+        for unit, turn, value in zip(plant.state_units, turns, goal, strict=True)
     ]
-    meant, hint = np.where(near, turns, problem.goal), ""
+    meant, hint = np.where(near, turns, goal), ""
     if np.max(np.abs(rates(meant))) <= AT_REST:
-        named = (
-            f"{plant.state_names[i]} = {_quarter_turns(int(quarters[i]))}"
-            for i in np.flatnonzero(meant != problem.goal)
-        )
+        named = (f"{plant.state_names[i]} = {_quarter_turns(int(quarters[i]))}" for i in np.flatnonzero(meant != goal))
         hint = f"; did you mean {', '.join(named)}?"
     text = (
         f"is no equilibrium without input: there the state's derivative is {found.tolist()} and would have to be zero"
     )
-    raise ConfigError([Fault(("task", "goal"), text + hint, problem.goal.tolist())])
+    raise ConfigError([Fault((*path, "goal"), text + hint, goal.tolist())])
 
 
-def _require_stabilizable(problem: Problem) -> None:
+def _require_stabilizable(problem: Problem, path: tuple[str, ...]) -> None:
     mode = unreached_mode(*linearized_goal(problem))
     if mode is None:
         return
@@ -197,7 +234,7 @@ def _require_stabilizable(problem: Problem) -> None:
         f"cannot be held: no input reaches the mode with the rate {rate.real:.3g} 1/s, in which "
         f"{problem.plant.state_names[state]} moves most"
     )
-    raise ConfigError([Fault(("task", "goal"), text, problem.goal.tolist())])
+    raise ConfigError([Fault((*path, "goal"), text, problem.goal.tolist())])
 
 
 def _quarter_turns(count: int) -> str:
@@ -224,7 +261,8 @@ def _require_agreement(problem: Problem) -> None:
 def _design(problem: Problem, share: float) -> eqx.Module:
     """At a share of the way from the initial design to the far corner of its box."""
     fields = (variable for variable in problem.variables if variable.design)
-    return problem.plant.Design(*(jnp.asarray(v.initial + share * (_far_end(v) - v.initial)) for v in fields))
+    design = problem.plant.Design(*(jnp.asarray(v.initial + share * (_far_end(v) - v.initial)) for v in fields))
+    return problem.edited(design)
 
 
 def _far_end(variable: Variable) -> float:

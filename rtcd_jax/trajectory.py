@@ -50,16 +50,18 @@ def plan(problem: Problem, candidates: Candidate) -> Trajectory:
     """
     settings = problem.config.trajectory
     if problem.config.at_rest:
-        return _rest(problem, candidates.q)
+        return _rest(problem, candidates)
     parameters = jax.tree.map(lambda leaf: jnp.moveaxis(leaf, 0, -1), candidates)
     control = interior_point.ControlProblem(
         interval=lambda x, u, h, candidate: interval_map(
-            problem, candidate, x, _inputs(problem, candidate, u), h, settings.substeps
+            problem.of(candidate), candidate, x, _inputs(problem, candidate, u), h, settings.substeps
         ),
-        rate=lambda x, u, candidate: problem.plant.dynamics(candidate.design, x, _inputs(problem, candidate, u)),
-        running=lambda x, u, candidate: _running(problem, x, _inputs(problem, candidate, u), candidate),
-        start=problem.start,
-        goal=problem.goal,
+        rate=lambda x, u, candidate: problem.of(candidate).plant.dynamics(
+            candidate.design, x, _inputs(problem, candidate, u)
+        ),
+        running=lambda x, u, candidate: _running(problem.of(candidate), x, _inputs(problem, candidate, u), candidate),
+        ends=lambda candidate: (problem.of(candidate).start, problem.of(candidate).goal),
+        travel=np.max([np.abs(each.start - each.goal) for each in problem.tasks or (problem,)], 0),
         state_limits=settings.limit_share * problem.state_limits,
         input_limits=settings.input_share * np.asarray(problem.input_limits(initial_design(problem))),
         step_limits=(settings.step.min, settings.step.max),
@@ -71,11 +73,15 @@ def plan(problem: Problem, candidates: Candidate) -> Trajectory:
         # A start that takes much longer than the one before it seldom ends better.
         allowance = jnp.where(best.solved, jnp.minimum(PATIENCE * best.iterations, most), most)
         allowance = jnp.where((index < settings.starts) | ~best.solved, allowance, 0)
-        found = interior_point.solve(control, parameters, guess, allowance)
+        found = interior_point.solve(control, parameters, own(guess), allowance)
         return _better(best, found, allowance > 0), None
 
+    def own(guess):
+        """Of several tasks, each candidate's."""
+        return jax.tree.map(lambda leaf: leaf[..., candidates.task], guess) if problem.tasks else guess
+
     family = starts(problem, parameters.q.dtype)
-    none = _nothing(family, candidates.q.shape[0])
+    none = _nothing(own(jax.tree.map(lambda leaf: leaf[0], family)), candidates.q.shape[0])
     best, _ = packed_scan(attempt, none, (np.arange(len(SHARES)), family), carry=False)
     us = _inputs(problem, parameters, jnp.moveaxis(best.us, 1, 0)).T
     xs, h = (jnp.moveaxis(leaf, -1, 0) for leaf in (best.xs, best.h))
@@ -83,14 +89,16 @@ def plan(problem: Problem, candidates: Candidate) -> Trajectory:
     return Trajectory(us, xs, h, best.cost, best.defect, best.iterations, status)
 
 
-def _rest(problem: Problem, like: Float[Array, "P n"]) -> Trajectory:
+def _rest(problem: Problem, candidates: Candidate) -> Trajectory:
     """At the goal, in the shortest intervals."""
-    count, knots, n = like.shape[0], problem.intervals + 1, problem.plant.n
+    like, knots = candidates.q, problem.intervals + 1
+    count, n = like.shape
+    goals = jnp.asarray(problem.of(candidates).goal, like.dtype).T.reshape(-1, 1, n)
     zero = jnp.zeros(count, like.dtype)
     none = jnp.zeros(count, jnp.int32)
     return Trajectory(
         us=jnp.zeros((count, knots - 1, problem.plant.m), like.dtype),
-        xs=jnp.broadcast_to(jnp.asarray(problem.goal, like.dtype), (count, knots, n)),
+        xs=jnp.broadcast_to(goals, (count, knots, n)),
         dt=zero + problem.config.trajectory.step.min,
         cost=zero,
         defect=zero,
@@ -102,10 +110,10 @@ def _rest(problem: Problem, like: Float[Array, "P n"]) -> Trajectory:
 def _inputs(problem: Problem, candidate: Candidate, us: Array | Components) -> Any:
     """The inputs' components that the optimizer's `us` stand for.
 
-    Its box is one for all candidates: where a motor's limit is a design, its inputs are those of the initial design's
-    motor, of which the candidate's gives the same share.
+    Its box is one for all candidates: where a motor's limit is a design's or a task's, its inputs are those of the
+    initial design's motor, of which the candidate's gives the same share.
     """
-    limits = problem.input_limits(candidate.design)
+    limits = problem.of(candidate).input_limits(candidate.design)
     if isinstance(limits, np.ndarray):
         return us
     known = problem.input_limits(initial_design(problem))
@@ -133,9 +141,11 @@ def _running(problem: Problem, x, u, candidate: Candidate):
     return 0.5 * (states + inputs) + problem.config.trajectory.time_weight
 
 
-def _nothing(family: interior_point.Guess, count: int) -> interior_point.Solution:
+def _nothing(guess: interior_point.Guess, count: int) -> interior_point.Solution:
     """What is known before the first start."""
-    xs, us, h = (jnp.broadcast_to(leaf[0, ..., None], (*leaf.shape[1:], count)) for leaf in family)
+    if not guess.h.ndim:
+        guess = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf[..., None], (*leaf.shape, count)), guess)
+    xs, us, h = guess
     zero = jnp.zeros(count, jnp.int32)
     return interior_point.Solution(us, xs, h, cost=0 * h, defect=jnp.inf + h, iterations=zero, solved=zero > 0)
 
@@ -148,12 +158,15 @@ def _better(best: interior_point.Solution, found: interior_point.Solution, tried
 
 
 def starts(problem: Problem, dtype: DTypeLike) -> interior_point.Guess:
-    """The family [G ...] of guesses: swing to and fro about the start, then into the goal, in longer and shorter times.
+    """The family [G ...] of guesses: swing to and fro about the start, then into the goal, in longer and shorter times;
+    [G ... T] of several tasks.
 
     Which one ends best depends on how many swings the candidate needs. They are motions, no solutions of the dynamics:
     rolling the dynamics out under a sinusoidal input and bending the end into the goal needs four times the iterations,
     and the straight line of the paper's code often fails.
     """
+    if problem.tasks:
+        return jax.tree.map(lambda *leaves: jnp.stack(leaves, -1), *(starts(each, dtype) for each in problem.tasks))
     step = problem.config.trajectory.step
     pace = slowest_oscillation(problem) / (2 * np.pi)
     family = []

@@ -52,13 +52,15 @@ def first_failure(*statuses: Int[Array, ""]) -> Int[Array, ""]:
 
 class Candidate(eqx.Module):
     """What the search chooses: the robot's design, the diagonals of the cost weights Q and R, and what it is asked to
-    choose of the policy's options, by name; the others are the configuration's numbers.
+    choose of the policy's options, by name; the others are the configuration's numbers. Of a problem with several tasks
+    a candidate is asked for one: `task` is its number.
     """
 
     design: eqx.Module
     q: Float[Array, "*batch n"]
     r: Float[Array, "*batch m"]
     policy: dict[str, Float[Array, "*batch"]] = eqx.field(default_factory=dict)
+    task: Int[Array, "*batch"] | None = None
 
 
 class Uncertainty(eqx.Module):
@@ -169,6 +171,32 @@ class Evaluation(eqx.Module):
         """The share of knots with a level under the uncertainty; None where nothing is uncertain."""
         return self.funnel.borne
 
+    @property
+    def tasks(self) -> None:
+        """It is of one task."""
+        return None
+
     def take(self, rows: Int[Array | np.ndarray, " E"]) -> "Evaluation":
+        """Of a population's evaluation: the candidates at `rows`."""
+        return jax.tree.map(lambda leaf: leaf[rows], self)
+
+
+class TaskEvaluations(eqx.Module):
+    """What is known of one genome on every one of several `tasks`, and what the search makes of it.
+
+    `volumes` are those over the tasks, knot by knot too; `status` is that of the first task that failed.
+    """
+
+    genome: Float[Array, "*batch d"]
+    tasks: Evaluation
+    volumes: Volumes
+    status: Int[Array, "*batch"]
+
+    @property
+    def borne(self) -> Float[Array, "*batch"] | None:
+        """The mean over the tasks of the share of knots with a level under the uncertainty."""
+        return None if self.tasks.borne is None else self.tasks.borne.mean(-1)
+
+    def take(self, rows: Int[Array | np.ndarray, " E"]) -> "TaskEvaluations":
         """Of a population's evaluation: the candidates at `rows`."""
         return jax.tree.map(lambda leaf: leaf[rows], self)

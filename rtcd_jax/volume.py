@@ -64,6 +64,12 @@ VOLUMES = {
 LATER = ("push", GOAL)
 """Those that older runs lack."""
 
+OVER_TASKS: dict[str, Callable[[Any], Any]] = {
+    "geometric_mean": lambda v: v.__array_namespace__().exp(v.__array_namespace__().log(v).mean(-1)),
+    "min": lambda v: v.min(-1),
+}
+"""What a search makes of the volumes [... T] of a candidate's tasks."""
+
 
 def funnel_volume(funnel: "Funnel", jumps: "Float[Array, 'knots n m']") -> "Volumes":
     """All `VOLUMES`, zero for a funnel whose status is not OK; `jumps` are `policy.input_jumps`."""

@@ -120,7 +120,7 @@ def test_a_population_is_its_candidates_one_by_one():
 def test_a_resampled_funnel_is_about_the_same_policy():
     """With the same budget and key it is the same funnel, with another key other levels but where a box ends them."""
     row = jax.tree.map(lambda leaf: leaf[pipeline.RTC], pipeline.evaluated())
-    again = jax.jit(partial(resample, pipeline.problem(), search_budget(pipeline.problem())))
+    again = jax.jit(partial(resample, pipeline.problem(), search_budget))
     assert_close(again(row, pipeline.GENERATION), row)
     other = again(row, jax.random.key(1))
     assert same(other.funnel.policy, row.funnel.policy)

@@ -60,7 +60,7 @@ def test_a_generation_and_an_elite_ask_nothing_of_the_host(problem):
     assert "xla_python" not in program
     shapes = jax.eval_shape(lambda genomes, key: evaluate(genomes, wrapped(key)), genomes, key)
     one = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape[1:], leaf.dtype), shapes)
-    again = partial(resample, problem, elite_budget(problem))
+    again = partial(resample, problem, elite_budget)
     assert calls(lowered(lambda evaluation, key: again(evaluation, wrapped(key)), one, key)) == set()
 
 

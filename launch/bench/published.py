@@ -49,7 +49,7 @@ def main() -> None:
 
     config = off_the_rail(load(_config("cartpole"))) if robot == "off_the_rail" else load(_config(robot))
     problem = make_problem(config)
-    evaluate = jax.jit(make_evaluate(problem, elite_budget(problem)))
+    evaluate = jax.jit(make_evaluate(problem, elite_budget))
     found = {}
     for name, values in CANDIDATES[robot].items():
         genome = jnp.asarray(encode(problem, values))

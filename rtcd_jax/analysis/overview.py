@@ -9,7 +9,7 @@ from rtcd_jax.analysis.report.reading import Run, read_run
 from rtcd_jax.analysis.report.tables import Cell, candidate, gains, verdict
 from rtcd_jax.analysis.report.words import duration, guarantee, listed, ratio, volume_unit, words
 from rtcd_jax.config.load import Config, differences
-from rtcd_jax.elite.records import elite_names, read_config, read_generations
+from rtcd_jax.elite.records import INITIAL, elite_names, read_config, read_elite, read_generations, task_folders
 from rtcd_jax.system.console import Console, table
 from rtcd_jax.system.errors import UserError
 from rtcd_jax.volume import VOLUMES
@@ -68,10 +68,22 @@ def _row(path: Path, console: Console) -> tuple[str, ...]:
     about = (course.config.plant.name, words(objective), course.generations)
     if not course.complete:
         return (*about, "", "", "not finished", "", bears)
+    if len(course.config.tasks) > 1:
+        initial, best = _over_tasks(path, objective)
+        gain = ratio(best, initial)
+        tasks = f"{len(course.config.tasks)} tasks, below"
+        return (*about, f"{best:.4g}", "" if gain is None else f"{gain:.3g}", "sampled", tasks, bears)
     run = read_run(path, console)
     gain = ratio(run.best.volumes[objective], run.initial.volumes[objective]) if run.initial else None
     best, times = f"{run.best.volumes[objective]:.4g}", "" if gain is None else f"{gain:.3g}"
     return (*about, best, times, _shown(run), verdict(run) or "", bears)
+
+
+def _over_tasks(path: Path, volume: str) -> tuple[float, float]:
+    """Over the tasks of a run for several: that of the initial and of the best candidate."""
+    records = read_elite(path, INITIAL)[1], read_elite(path / "elites", elite_names(path)[0])[1]
+    first, last = (float(record["volumes"][volume]) for record in records)
+    return first, last
 
 
 def _shown(run: Run) -> str:
@@ -92,6 +104,14 @@ def show_run(path: Path, console: Console) -> Iterator[str]:
     yield f"bears: {bears}"
     if not course.complete:
         yield "not finished: the command that began it goes on"
+        return
+    if len(course.config.tasks) > 1:
+        first, last = _over_tasks(path, search.objective)
+        over = f"{words(search.over_tasks)} over {len(course.config.tasks)} tasks"
+        yield f"{words(search.objective)}, {over}: initial {first:.4g}, best {last:.4g} (sampled)"
+        for folder in task_folders(path):
+            yield f"task {folder.name}:"
+            yield from show_run(folder, console)
         return
     run = read_run(path, console)
     if run.seconds is not None:

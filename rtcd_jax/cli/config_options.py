@@ -7,7 +7,7 @@ from tyro.constructors import StructFieldSpec
 from rtcd_jax.cli.options import Branch, section
 from rtcd_jax.config.load import Config
 from rtcd_jax.config.plants import MjcfPlant, PackagedPlant, PlantConfig
-from rtcd_jax.config.schema import Variable
+from rtcd_jax.config.schema import TaskChanges, Variable
 from rtcd_jax.config.settings import Settings, unit
 
 
@@ -23,7 +23,16 @@ def config_branch(config: Config) -> Branch:
     branches = {"task": task, "design": _group(design), "weights": _group(weights), "policy": policy}
     if not isinstance(plant, PackagedPlant):
         branches["plant"] = _own_plant(plant)
-    return _section(config, branches=branches)
+    if config.tasks:
+        branches["tasks"] = _group({name: _of_task(changes, plant) for name, changes in config.tasks.items()})
+    whole = _section(config, branches=branches)
+    return whole if config.tasks else Branch(tuple(field for field in whole.fields if field.name != "tasks"))
+
+
+def _of_task(changes: TaskChanges, plant: PlantConfig) -> Branch:
+    """A task's ends; what it changes of the robot is the file's."""
+    branch, kept = _section(changes, ", ".join(plant.states.values())), {"plant": changes.plant}
+    return Branch(tuple(field for field in branch.fields if field.name != "plant"), lambda **own: own | kept)
 
 
 def _own_plant(plant: PlantConfig) -> Branch:

@@ -53,6 +53,8 @@ def _section(name: str, field: FieldInfo) -> Iterator[str]:
         for title, model in OWN.items():
             yield f"### {title}\n"
             yield _table(_rows(f"{name}.", model))
+    elif get_origin(kind) is dict and get_args(kind)[1] is not Variable:
+        yield _table(_rows(f"{name}.NAME.", _model(get_args(kind)[1])))
     elif get_origin(kind) is dict:
         for plant, model in PLANTS.items():
             yield f"### {plant}\n"

@@ -16,11 +16,21 @@ from rtcd_jax.config.schema import REFINABLE, REFINEMENT_STEPS
 from rtcd_jax.config.settings import refusal
 from rtcd_jax.system.console import Console, silent
 from rtcd_jax.system.devices import cores
-from rtcd_jax.system.errors import Problem
+from rtcd_jax.system.errors import Problem, UserError
 
 
 def _verdict(held: bool) -> Exit:
     return Exit.OK if held else Exit.REFUTED
+
+
+def _each_task(run: Path, console: Console) -> Iterator[Path]:
+    """The folder of every task of a run, said aloud where there are several; of one task the run's own."""
+    from rtcd_jax.elite.records import task_folders
+
+    for folder in task_folders(run):
+        if folder != run:
+            console.message(f"task {folder.name}:")
+        yield folder
 
 
 class VerifyOptions(Options):
@@ -42,7 +52,9 @@ class VerifyOptions(Options):
 def verify(options: VerifyOptions, console: Console) -> Exit:
     from rtcd_jax.analysis.verify.run import verify_run
 
-    return _verdict(verify_run(options.run, options.states, options.seed, options.workers or cores(), console))
+    how = options.states, options.seed, options.workers or cores(), console
+    held = [verify_run(folder, *how) for folder in _each_task(options.run, console)]
+    return _verdict(all(held))
 
 
 class ReportOptions(Options):
@@ -132,6 +144,11 @@ def diff(options: DiffOptions, console: Console) -> Exit:
     return Exit.OK
 
 
+def _within(target: Path, folder: Path, run: Path) -> Path:
+    """Where in a target a task's results go: with several in a folder of its own."""
+    return target if folder == run else target / folder.name
+
+
 class AnimateOptions(Options):
     """Show the swing-up by MuJoCo's renderer as MP4 and GIF: initial beside best, undisturbed and disturbed.
 
@@ -148,7 +165,9 @@ class AnimateOptions(Options):
 def animate(options: AnimateOptions, console: Console) -> Exit:
     from rtcd_jax.analysis.animate.animate import animate_run
 
-    animate_run(options.run, options.to, options.seed, console)
+    for folder in _each_task(options.run, console):
+        to = options.to and _within(options.to, folder, options.run)
+        animate_run(folder, to, options.seed, console)
     return Exit.OK
 
 
@@ -198,7 +217,8 @@ class DisturbOptions(Options):
 def disturb(options: DisturbOptions, console: Console) -> Exit:
     from rtcd_jax.analysis.disturb import disturb_run
 
-    disturb_run(options.run, options.states, options.seed, console)
+    for folder in _each_task(options.run, console):
+        disturb_run(folder, options.states, options.seed, console)
     return Exit.OK
 
 
@@ -225,7 +245,8 @@ class ToleranceOptions(Options):
 def tolerance(options: ToleranceOptions, console: Console) -> Exit:
     from rtcd_jax.analysis.tolerance.study import tolerance_run
 
-    tolerance_run(options.run, options.elite, options.uncertainty, console, options.prove)
+    for folder in _each_task(options.run, console):
+        tolerance_run(folder, options.elite, options.uncertainty, console, options.prove)
     return Exit.OK
 
 
@@ -246,7 +267,9 @@ class ExportOptions(Options):
 def export(options: ExportOptions, console: Console) -> Exit:
     from rtcd_jax.export import export_run
 
-    export_run(options.run, options.elite, options.to, console, options.name)
+    for folder in _each_task(options.run, console):
+        target = _within(options.to, folder, options.run)
+        export_run(folder, options.elite, target, console, options.name)
     return Exit.OK
 
 
@@ -319,12 +342,22 @@ def certify(options: CertifyOptions, console: Console) -> Exit:
     workers, only = options.workers or cores(), None if options.elite is None else elite_name(options.elite)
     how = options.optimize_value, options.uncertainty, options.solver, only
     with heeding_sigterm():
-        return _verdict(certify_run(options.run, options.elites, options.guarantee, workers, console, *how))
+        folders = _each_task(options.run, console)
+        goals = [certify_run(each, options.elites, options.guarantee, workers, console, *how) for each in folders]
+        return _verdict(all(goals))
 
 
 def _certificate(path: Path) -> Path:
     """The best elite's, of a run folder."""
-    return path / "certificates" / "000.json" if path.is_dir() else path
+    if not path.is_dir():
+        return path
+    from rtcd_jax.elite.records import require_one_task
+
+    try:
+        require_one_task(path)
+    except UserError as error:
+        raise refusal(str(error).removeprefix(f"{path} ")) from None
+    return path / "certificates" / "000.json"
 
 
 class FalsifyOptions(Options):

@@ -6,6 +6,7 @@
 import hashlib
 import inspect
 import json
+import re
 from collections.abc import Callable, Collection, Iterator, Mapping
 from pathlib import Path
 from typing import Annotated, Any
@@ -15,27 +16,32 @@ from pydantic import (
     Field,
     PlainValidator,
     SerializeAsAny,
+    SerializerFunctionWrapHandler,
     ValidationError,
     ValidationInfo,
     create_model,
     field_validator,
+    model_serializer,
 )
 
 from rtcd_jax.config import mjcf, yaml12
+from rtcd_jax.config.arithmetic import arithmetic
 from rtcd_jax.config.plants import PackagedPlant, PlantConfig, read_plant
+from rtcd_jax.config.robot import Value, needs
 from rtcd_jax.config.schema import (
     CheckpointConfig,
     ElitesConfig,
     FunnelConfig,
     PolicyConfig,
     SearchConfig,
+    TaskChanges,
     TaskConfig,
     TrajectoryConfig,
     UncertaintyConfig,
     Variable,
     WeightsConfig,
 )
-from rtcd_jax.config.settings import Settings, problems_of
+from rtcd_jax.config.settings import Settings, problems_of, refusal
 from rtcd_jax.system.errors import ConfigError, Problem, closest, printable
 from rtcd_jax.volume import GOAL
 
@@ -55,9 +61,14 @@ LATER_KEYS = (
     ("search", "at_least"),
     ("search", "refine"),
     ("search", "patience"),
+    ("search", "over_tasks"),
     ("trajectory", "input_share"),
 )
 """At their defaults they leave the hashes of configurations as they were before there were such keys."""
+
+
+_NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]{0,63}")
+"""Of a task: it becomes a folder's."""
 
 
 class Config(Settings):
@@ -65,6 +76,9 @@ class Config(Settings):
 
     plant: Annotated[SerializeAsAny[PlantConfig], PlainValidator(read_plant)] = Field(description="the robot")
     task: TaskConfig = Field(description="from where to where, and within what")
+    tasks: dict[str, TaskChanges] = Field(
+        default={}, description="of one design for several tasks, by name: what each has of its own"
+    )
     design: dict[str, Variable] = Field(description="the plant's design fields by name, all >= 1e-6")
     weights: WeightsConfig = Field(description="cost weights >= 1e-9, searched on a log scale")
     trajectory: TrajectoryConfig = Field(default=TrajectoryConfig(), description="the nominal motion")
@@ -84,8 +98,40 @@ class Config(Settings):
         known = {name: design[name] for name in names if name in design}
         return known | design
 
+    @field_validator("tasks", mode="before")
+    @classmethod
+    def _some(cls, tasks: Any) -> Any:
+        if isinstance(tasks, Mapping) and not tasks:
+            raise refusal("must name a task at least; leave the key away where there is the one of `task` alone")
+        return tasks
+
+    @model_serializer(mode="wrap")
+    def _without_no_tasks(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        return {key: value for key, value in handler(self).items() if key != "tasks" or value}
+
     def problems(self) -> Iterator[Problem]:
         return _across_sections(dict(self))
+
+    @property
+    def each(self) -> "dict[str, Config]":
+        """The configuration of each of its tasks alone, by name: that of a whole run, with one task; "" for `task`."""
+        return {name: self.of_task(name) for name in self.tasks} or {"": self}
+
+    def of_task(self, name: str) -> "Config":
+        """That of one of its `tasks`: start, goal and the plant's constants are in their sections, `tasks` keeps it and
+        what it changes of the design.
+        """
+        changes, known = self.tasks[name], self.plant.values()
+        ends = {key: getattr(changes, key) for key in ("start", "goal") if getattr(changes, key)}
+        constants = {key: _number(value, known) for key, value in changes.plant.items() if key in known}
+        design = {key: value for key, value in changes.plant.items() if key not in known}
+        update = {"task": self.task.model_copy(update=ends), "tasks": {name: TaskChanges(plant=design)}}
+        return self.model_copy(update=update | ({"plant": self.plant.edited(constants)} if constants else {}))
+
+    @property
+    def design_edits(self) -> Mapping[str, Value]:
+        """Numbers or arithmetic that the only one of its tasks has in the place of design fields."""
+        return next(iter(self.tasks.values())).plant if len(self.tasks) == 1 else {}
 
     @property
     def design_units(self) -> dict[str, str]:
@@ -142,6 +188,58 @@ def _ends(task: TaskConfig, trajectory: TrajectoryConfig) -> Iterator[Problem]:
             elif abs(value) > share * limit:
                 text = f"must lie in [-{share * limit:g}, {share * limit:g}] (trajectory.limit_share of the limit)"
                 yield Problem(("task", key, i), text, value)
+
+
+def _tasks(
+    plant: PlantConfig, task: TaskConfig, tasks: dict[str, TaskChanges], design: dict[str, Variable],
+    trajectory: TrajectoryConfig, search: SearchConfig,
+) -> Iterator[Problem]:  # fmt: skip
+    folders: dict[str, str] = {}
+    for name, changes in tasks.items():
+        path = "tasks", name
+        if not _NAME.fullmatch(name):
+            yield Problem(path, "must be a letter and up to 63 letters, digits and _: it names a folder")
+        elif (other := folders.setdefault(name.lower(), name)) != name:
+            yield Problem(path, f"differs from {other} by its case alone: both would have one folder")
+        own = {key: value for key in ("start", "goal") if (value := getattr(changes, key))}
+        whole = task.model_copy(update=own)
+        for key, value in own.items():
+            yield from _size((*path, key), value, plant.states)
+        if own:
+            ends = (fault for fault in _ends(whole, trajectory) if fault.path[1] in own)
+            yield from (fault._replace(path=(*path, *fault.path[1:])) for fault in ends)
+            yield from (fault._replace(path=(*path, *fault.path[1:])) for fault in _motion(whole, search))
+        yield from (fault._replace(path=(*path, "plant", *fault.path)) for fault in _edits(plant, design, changes))
+    if len(tasks) > 1 and search.refine:
+        yield Problem(("search", "refine"), "must be false with several tasks: an elite is refined for one", True)
+
+
+def _edits(plant: PlantConfig, design: dict[str, Variable], changes: TaskChanges) -> Iterator[Problem]:
+    """What is wrong with a task's changes of the robot."""
+    known, constants = plant.values(), {}
+    names = tuple(dict.fromkeys((*known, *design)))
+    for key, value in changes.plant.items():
+        if key in known:
+            try:
+                constants[key] = _number(value, known)
+            except ValueError as error:
+                yield Problem((key,), str(error), value)
+        elif key in design:
+            for other in needs(value):
+                if other not in names:
+                    yield Problem((key,), f"names {other}; there is {', '.join(('pi', *names))}", value)
+        elif key in type(plant).model_fields:
+            yield Problem((key,), "is the same in all tasks: only numbers and design fields may differ", value)
+        else:
+            yield Problem((key,), f"must be a constant or a design field of {plant.name}; {closest(key, names)}", value)
+    try:
+        plant.edited(constants)
+    except ValidationError as error:
+        yield from (fault._replace(path=fault.path[-1:]) for fault in problems_of(error))
+
+
+def _number(value: Value, names: Mapping[str, float]) -> float:
+    return arithmetic(value, names) if isinstance(value, str) else value
 
 
 def _motion(task: TaskConfig, search: SearchConfig) -> Iterator[Problem]:
@@ -217,6 +315,7 @@ _ACROSS: tuple[Callable[..., Iterator[Problem]], ...] = (
     _weight_sizes,
     _ends,
     _motion,
+    _tasks,
     _design_names,
     _units,
     _positive_design,
@@ -245,7 +344,8 @@ def _valid_sections(data: Mapping[str, Any], failed: set[str | int]) -> dict[str
 def parse(data: Any, source: str = "configuration") -> Config:
     """The configuration that a mapping describes; `ConfigError` names everything that is wrong with it."""
     try:
-        return Config.model_validate(data)
+        config = Config.model_validate(data)
+        return next(iter(config.each.values())) if len(config.tasks) == 1 else config
     except ValidationError as error:
         problems = problems_of(error)
     if isinstance(data, Mapping):

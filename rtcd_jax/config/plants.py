@@ -7,7 +7,7 @@ import re
 from collections.abc import Iterator, Mapping
 from functools import cache
 from pathlib import Path, PurePath
-from typing import Annotated, Any, ClassVar, Literal, cast
+from typing import Annotated, Any, ClassVar, Literal, Self, cast
 
 from pydantic import BeforeValidator, Field, PlainSerializer, PlainValidator, ValidationError, create_model
 
@@ -45,16 +45,20 @@ class PlantConfig(Settings):
         """What may be uncertain of `design` and of the `plant`'s constants: all but the motors' limits."""
         raise NotImplementedError
 
+    def values(self) -> dict[str, float]:
+        """The constants' numbers by name."""
+        raise NotImplementedError
+
+    def edited(self, values: Mapping[str, float]) -> Self:
+        """The same robot with other numbers for some of its constants; pydantic's error where one leaves its range."""
+        raise NotImplementedError
+
 
 class RobotPlant(PlantConfig):
     """A robot that an MJCF describes."""
 
     def robot(self, units: Mapping[str, str] | None = None) -> Robot:
         """The robot as data; `units` are those of a design that has none of its own."""
-        raise NotImplementedError
-
-    def values(self) -> dict[str, float]:
-        """The constants' numbers by name."""
         raise NotImplementedError
 
     def with_parameters(self, parameters: Mapping[str, float]) -> "RobotPlant":
@@ -159,6 +163,9 @@ class PackagedPlant(RobotPlant):
 
     def values(self) -> dict[str, float]:
         return {name: getattr(self, name) for name, each in self.packaged.constants.items() if not each.choices}
+
+    def edited(self, values: Mapping[str, float]) -> Self:
+        return self.model_validate({**dict(self), **values})
 
     def robot(self, units: Mapping[str, str] | None = None) -> Robot:
         given = self.packaged
@@ -277,6 +284,9 @@ class MjcfPlant(RobotPlant):
         }
         return given | own | of_mjcf
 
+    def edited(self, values: Mapping[str, float]) -> Self:
+        return self.model_validate(self.with_parameters(self.values() | dict(values)).model_dump())
+
     def robot(self, units: Mapping[str, str] | None = None) -> Robot:
         names, derived = _names(self.xml), self._derived()
         limits = {motor.name: cast(Value, f"{motor.name}_limit") for motor in names.motors}
@@ -347,6 +357,12 @@ class PythonPlant(PlantConfig):
         if missing or inspect.isabstract(found):
             raise TypeError("must be a subclass of rtcd_jax.plants.base.Plant that has all of its parts")
         return found
+
+    def values(self) -> dict[str, float]:
+        return dict(self.constants)
+
+    def edited(self, values: Mapping[str, float]) -> Self:
+        return self.model_validate({**dict(self), "constants": self.constants | dict(values)})
 
     @property
     def states(self) -> dict[str, str]:

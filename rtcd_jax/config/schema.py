@@ -20,10 +20,11 @@ from pydantic import (
 from pydantic_core.core_schema import CoreSchema, no_info_plain_validator_function
 
 from rtcd_jax.config.arithmetic import arithmetic
+from rtcd_jax.config.plants import Number as Arithmetic
 from rtcd_jax.config.plants import PlantConfig
 from rtcd_jax.config.settings import Settings, invalid, refusal
 from rtcd_jax.system.errors import Problem, closest
-from rtcd_jax.volume import VOLUMES
+from rtcd_jax.volume import OVER_TASKS, VOLUMES
 
 UNIT = "its unit"
 """Stands in a description for the unit that the plant gives."""
@@ -90,6 +91,21 @@ class TaskConfig(Settings):
         for i, limit in enumerate(self.state_limits):
             if LARGEST_LIMIT < limit < inf:
                 yield Problem(("state_limits", i), f"must be <= {LARGEST_LIMIT:g}, or .inf for none", limit)
+
+
+class TaskChanges(Settings):
+    """One of several tasks: what it has of its own; all else is as `task` says."""
+
+    start: Numbers = Field(default=(), description=f"its first state; empty: that of `task` [{UNIT}]")
+    goal: Numbers = Field(default=(), description=f"its last state, an equilibrium; empty: that of `task` [{UNIT}]")
+    plant: dict[str, Arithmetic] = Field(
+        default={},
+        description="constants and design fields that differ in it: numbers, or arithmetic [their units]",
+    )
+
+    @model_serializer(mode="wrap")
+    def _own(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        return {key: value for key, value in handler(self).items() if value}
 
 
 class WeightsConfig(Settings):
@@ -324,9 +340,9 @@ SMALLEST_POPULATION = 4
 
 
 if TYPE_CHECKING:
-    Objective = str
+    Objective = OverTasks = str
 else:
-    Objective = Literal[tuple(VOLUMES)]
+    Objective, OverTasks = Literal[tuple(VOLUMES)], Literal[tuple(OVER_TASKS)]
 
 
 REFINABLE = ("gains", "shapes")
@@ -358,6 +374,10 @@ class SearchConfig(Settings):
         ge=0,
         le=1_000_000,
         description="(outer) generations without 0.1 % of gain after which the search ends; 0: never [-]",
+    )
+    over_tasks: OverTasks = Field(
+        default="geometric_mean",
+        description="of several tasks: what of their volumes is maximized; min: ties by the geometric mean",
     )
     sigma: float = Field(default=0.3, ge=1e-6, le=1, description="initial step size in the unit box [-]")
     seed: int = Field(default=0, ge=0, lt=2**32, description="of all random numbers [-]")

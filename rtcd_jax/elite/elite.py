@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from rtcd_jax.config.plants import PlantConfig, stored_plant
-from rtcd_jax.elite.records import INITIAL, elite_folder, elite_name, read_elite, require_elites
+from rtcd_jax.elite.records import INITIAL, elite_folder, elite_name, read_elite, require_elites, require_one_task
 from rtcd_jax.system.errors import UserError, printable
 
 CLAIMED = "claimed"
@@ -130,9 +130,10 @@ class Elite:
         Raises:
             NoFunnel: that candidate has none.
             UserError: no run folder, a search that is not finished, no such elite (the error has those that are
-                there), damaged files, or as `of`.
+                there), a run for several tasks instead of the folder of one, damaged files, or as `of`.
         """
         name, there = elite_name(which), require_elites(run)
+        require_one_task(run)
         if name != INITIAL and name not in there:
             raise UserError(f"{run} has no elite {name}; there are {', '.join(there)}")
         folder = elite_folder(run, name)

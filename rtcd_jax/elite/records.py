@@ -6,6 +6,9 @@
     initial.npz, initial.json  the configuration's initial candidate
     elites/NNN.npz, NNN.json   the best candidates, 000 first
 
+Of a run for several tasks the elites and the initial candidate have here what the tasks have in common, and each task
+has a folder tasks/NAME, which reads as a run for this task alone; its mark says so, and both are of version 2.
+
 Numbers that are not finite are stored as null.
 """
 
@@ -25,6 +28,10 @@ from rtcd_jax.system.files import read_json, reading, replace, replace_json
 
 FORMAT = "rtcd_jax run"
 VERSION = 1
+SEVERAL = 2
+"""The version of a run for several tasks, and of their folders."""
+TASKS = "tasks"
+"""The folder of the tasks' own."""
 INITIAL = "initial"
 """Name of the configuration's candidate beside the elites "000", "001", …."""
 _RESTORE = "restore it, or make the run again"
@@ -98,6 +105,46 @@ def require_elites(path: Path) -> list[str]:
     return names
 
 
+def task_folders(path: Path) -> list[Path]:
+    """Of a finished run: the folders of its tasks, in the configuration's order, or its own where there is one task.
+
+    Raises UserError as `require_elites`, and where a task's folder is missing.
+    """
+    require_elites(path)
+    mark = _mark(path)
+    if mark.get("version") != SEVERAL or "task" in mark:
+        return [path]
+    folders = [path / TASKS / name for name in read_config(path).tasks]
+    for folder in folders:
+        _require_run(folder)
+    return folders
+
+
+def require_one_task(path: Path) -> None:
+    """Raises UserError if the folder is that of a run for several tasks; the error names those that are meant."""
+    folders = task_folders(path)
+    if folders != [path]:
+        raise UserError(f"{path} is for several tasks: say which, {' or '.join(map(str, folders))}")
+
+
+def task_of(path: Path) -> str:
+    """The task whose folder this is, in a run for several; empty for a run of its own."""
+    return str(_mark(path).get("task", ""))
+
+
+def mark_of(config: Config, task: str = "") -> Record:
+    """What format.json says of a run with this configuration or, in a run for several tasks, of a task's folder."""
+    if task:
+        return {"format": FORMAT, "version": SEVERAL, "task": task}
+    return {"format": FORMAT, "version": SEVERAL if len(config.tasks) > 1 else VERSION}
+
+
+def _mark(path: Path) -> dict[str, Any]:
+    """What format.json says; nothing where there is none, as beside single elites."""
+    file = path / "format.json"
+    return read_json(file, "choose another folder") if file.is_file() else {}
+
+
 def read_config(path: Path) -> Config:
     """The configuration of a run. Raises UserError if the folder is no run folder that this version reads."""
     _require_run(path)
@@ -127,12 +174,12 @@ def read_generations(path: Path) -> list[dict[str, Any]]:
 
 def require_format(path: Path) -> None:
     """Raises UserError if the folder's mark is not that of this version."""
-    file = path / "format.json"
-    mark = read_json(file, "choose another folder")
+    file, mark = path / "format.json", _mark(path)
     name, version = mark.get("format"), mark.get("version")
-    if (name, version) != (FORMAT, VERSION):
+    if name != FORMAT or version not in (VERSION, SEVERAL):
         raise UserError(
-            f"{file} says {name!r}, version {version!r}, but this rtcd_jax reads {FORMAT!r}, version {VERSION}: "
+            f"{file} says {name!r}, version {version!r}, but this rtcd_jax reads {FORMAT!r}, version {VERSION} or "
+            f"{SEVERAL}: "
             "go on with the version in provenance.json, or choose another folder"
         )
 

@@ -12,7 +12,14 @@ from rtcd_jax.problem import AT_REST, Problem, initial_design, linearized_goal
 
 
 def understood(problem: Problem) -> Iterator[str]:
-    """Lines about the robot, its equations, the task's ends and what is searched, all of the initial design."""
+    """Lines about the robot, its equations, the task's ends and what is searched, all of the initial design; of several
+    tasks for each.
+    """
+    if problem.tasks:
+        for name, alone in zip(problem.config.tasks, problem.tasks, strict=True):
+            yield f"task       {name}"
+            yield from understood(alone)
+        return
     plant, design = problem.plant, initial_design(problem)
     yield f"robot      {problem.config.plant.name}: {plant.convention}"
     bounds = zip(plant.state_names, plant.state_units, problem.state_limits, strict=True)

@@ -27,13 +27,14 @@ import numpy as np
 from rtcd_jax.config import load as configuration
 from rtcd_jax.config.load import Config
 from rtcd_jax.elite.records import (
-    FORMAT,
-    VERSION,
+    INITIAL,
     Arrays,
     Record,
     elite_names,
+    mark_of,
     require_format,
     stored_config,
+    task_of,
     write_elite,
 )
 from rtcd_jax.system.errors import UserError
@@ -243,20 +244,11 @@ class RunFolder:
 
     def write_initial(self, arrays: Arrays, record: Record) -> None:
         """The configuration's initial candidate, in the elites' format."""
-        write_elite(self.path, "initial", arrays, record)
+        write_elite(self.path, INITIAL, arrays, record)
 
     def write_elites(self, elites: Iterable[tuple[Arrays, Record]]) -> None:
         """All elites, best first; those that were stored beyond their number are removed."""
-        folder = self.path / "elites"
-        make_folder(folder)
-        written = set()
-        for index, (arrays, record) in enumerate(elites):
-            written.add(f"{index:03d}")
-            write_elite(folder, f"{index:03d}", arrays, record)
-        with writing(folder):
-            for name in set(elite_names(self.path)) - written:
-                (folder / f"{name}.json").unlink()
-                (folder / f"{name}.npz").unlink(missing_ok=True)
+        write_elites(self.path, elites)
 
     def _cut(self, generations: int) -> None:
         """Leaves the complete lines of the first `generations` alone."""
@@ -269,6 +261,20 @@ class RunFolder:
         with reading(self._lines_path, _FORGET):
             content = self._lines_path.read_bytes()
         replace(self._lines_path, b"".join(content[line.start : line.start + line.length] for line in earlier))
+
+
+def write_elites(path: Path, elites: Iterable[tuple[Arrays, Record]]) -> None:
+    """All elites of a run or a task, best first; those that were stored beyond their number are removed."""
+    folder = path / "elites"
+    make_folder(folder)
+    written = set()
+    for index, (arrays, record) in enumerate(elites):
+        written.add(f"{index:03d}")
+        write_elite(folder, f"{index:03d}", arrays, record)
+    with writing(folder):
+        for name in set(elite_names(path)) - written:
+            (folder / f"{name}.json").unlink()
+            (folder / f"{name}.npz").unlink(missing_ok=True)
 
 
 class _Line(NamedTuple):
@@ -319,17 +325,19 @@ def _mend_mark(path: Path, notes: list[str]) -> None:
         others = (path / "config.yaml", path / "provenance.json", path / "generations.jsonl")
         if not all(file.is_file() for file in others) or (mark.exists() and not mark.is_file()):
             return
-    stored_config(path)
+    config = stored_config(path)
     if "config_hash" in read_json(path / "provenance.json", _FORGET):
-        replace_json(mark, {"format": FORMAT, "version": VERSION})
+        replace_json(mark, mark_of(config))
         notes.append(f"{mark} was lost or damaged, and is written again")
 
 
 def _claim(path: Path, config: Config) -> None:
     """Writes format.json and config.yaml, or checks those that are there. format.json first: it marks the folder."""
     if not (path / "format.json").is_file():
-        replace_json(path / "format.json", {"format": FORMAT, "version": VERSION})
+        replace_json(path / "format.json", mark_of(config))
     require_format(path)
+    if task_of(path):
+        raise UserError(f"{path} is a task of the run {path.parent.parent}, whose command goes on with it")
     if not (path / "config.yaml").is_file():
         _require_hash(path, configuration.config_hash(config))
         replace(path / "config.yaml", configuration.dump(config).encode())

@@ -1,8 +1,10 @@
 """Evaluation -> the stable result format of `elites/NNN.npz` and `NNN.json`, which others read."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -14,7 +16,7 @@ from rtcd_jax.genome import decode
 from rtcd_jax.numerics.proportion import failure_bound
 from rtcd_jax.policy import input_jumps, options
 from rtcd_jax.problem import Problem
-from rtcd_jax.types import Evaluation, Funnel, Policy, Status, Trajectory
+from rtcd_jax.types import Evaluation, Funnel, Policy, Status, TaskEvaluations, Trajectory
 from rtcd_jax.validation import PhysicsComparison
 from rtcd_jax.volume import VOLUMES, funnel_volume, largest_pushes
 
@@ -37,7 +39,7 @@ def arrays_of(problem: Problem, evaluation: Evaluation) -> dict[str, np.ndarray]
         "Q": np.diag(host.candidate.q),
         "R": np.diag(host.candidate.r),
         "K_goal": policy.gains[-1],
-        "x_goal": problem.goal,
+        "x_goal": np.asarray(problem.goal),
         "u_max": np.asarray(problem.input_limits(host.candidate.design)),
         "volumes_per_knot": volumes.per_knot,
         "pushes": _pushes(problem, evaluation)[0],
@@ -83,12 +85,13 @@ def record_of(
     plant, config = problem.plant, problem.config
     funnel, volumes = host.funnel, host.volumes
     design = host.candidate.design
+    searched = _searched_design(problem, host)
     candidates = (1 if refinement is None else 2) * (config.elites.count + 1)  # what it was is one of them
     return {
         "plant": config.plant.name,
         **({} if config.plant.name in PLANTS else {"robot": config.plant.model_dump(mode="json")}),
         "parameters": plant.parameters(design),
-        "design": {name: float(getattr(design, name)) for name in plant.design_units},
+        "design": {name: float(getattr(searched, name)) for name in plant.design_units},
         "weights": {"q": host.candidate.q, "r": host.candidate.r},
         "policy": options(problem, host.candidate),
         "units": {
@@ -123,6 +126,45 @@ def record_of(
         "seed": config.search.seed,
         "config_hash": config_hash(config),
     }
+
+
+def common_arrays(evaluation: TaskEvaluations) -> dict[str, np.ndarray]:
+    """The numbers that a candidate has in common on all tasks."""
+    return {"genome": np.asarray(evaluation.genome)}
+
+
+def common_record(problem: Problem, evaluation: TaskEvaluations) -> dict[str, Any]:
+    """What a candidate has in common on all of the problem's tasks: design, weights, and the volumes over them."""
+    host, config = jax.tree.map(np.asarray, evaluation), problem.config
+    candidate = decode(problem, jnp.asarray(host.genome))
+    each = {
+        name: {
+            "status": Status(int(host.tasks.status[t])).name,
+            "volumes": {volume: host.tasks.volumes[volume][t] for volume in VOLUMES},
+        }
+        for t, name in enumerate(config.tasks)
+    }
+    return {
+        "plant": config.plant.name,
+        "design": {name: float(getattr(candidate.design, name)) for name in problem.plant.design_units},
+        "weights": {"q": np.asarray(candidate.q), "r": np.asarray(candidate.r)},
+        "policy": options(problem, candidate),
+        "status": Status(int(host.status)).name,
+        "rung": "sampled",
+        "over_tasks": config.search.over_tasks,
+        "volumes": {name: host.volumes[name] for name in VOLUMES},
+        "tasks": each,
+        "seed": config.search.seed,
+        "config_hash": config_hash(config),
+    }
+
+
+def _searched_design(problem: Problem, evaluation: Evaluation) -> eqx.Module:
+    """The design that the search chose, without what the task changes of it."""
+    if not problem.config.design_edits:
+        return evaluation.candidate.design
+    unchanged = replace(problem, config=problem.config.model_copy(update={"tasks": {}}))
+    return decode(unchanged, jnp.asarray(evaluation.genome)).design
 
 
 def _pushes(problem: Problem, evaluation: Evaluation) -> tuple[np.ndarray, np.ndarray]:

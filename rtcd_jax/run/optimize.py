@@ -4,6 +4,7 @@ import math
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -11,23 +12,24 @@ import numpy as np
 
 from rtcd_jax.config.load import Config
 from rtcd_jax.config.schema import REFINABLE, REFINEMENT_STEPS
-from rtcd_jax.elite.records import Record, elite_names, read_generations
+from rtcd_jax.elite.records import TASKS, Record, elite_names, read_generations
 from rtcd_jax.evaluation import device_chunk, make_evaluate
 from rtcd_jax.genome import initial_genome
 from rtcd_jax.problem import Problem, make_problem
 from rtcd_jax.refinement import Refinement
 from rtcd_jax.run import live
 from rtcd_jax.run.folder import RunFolder
-from rtcd_jax.run.format import arrays_of, record_of
-from rtcd_jax.run.reevaluation import Reevaluation, Reported, physics_line, row
+from rtcd_jax.run.format import arrays_of, common_arrays, common_record, record_of
+from rtcd_jax.run.reevaluation import Reevaluation, Reported, parts_of, physics_line, row
 from rtcd_jax.run.refine import PARTIAL, PartialState, refine_elites
 from rtcd_jax.run.sharding import Sharded, sharded
+from rtcd_jax.run.tasks import store_task
 from rtcd_jax.search import search
 from rtcd_jax.search.archive import Elites, cost, shortfall
 from rtcd_jax.system.cluster import Cluster, Preempted
 from rtcd_jax.system.console import Clock, Console, Progress, times
 from rtcd_jax.system.errors import UserError
-from rtcd_jax.types import Evaluation, Status
+from rtcd_jax.types import Status, TaskEvaluations
 from rtcd_jax.volume import VOLUMES
 
 LAST_FILE = Path("initial.json")
@@ -47,7 +49,8 @@ def optimize(config: Config, folder: Path, console: Console, cluster: Cluster, l
     share = -(-config.search.population // len(cluster.devices))
     chunk = device_chunk(problem, share, cluster.memory)
     evaluate = sharded(make_evaluate(problem), cluster, chunk)
-    plan = search.Plan(config.search, config.elites, tuple(initial_genome(problem).tolist()), problem.design_dims)
+    first, tasks = tuple(initial_genome(problem).tolist()), tuple(config.tasks if problem.tasks else ())
+    plan = search.Plan(config.search, config.elites, first, problem.design_dims, tasks)
     genomes = jnp.zeros((config.search.population, len(problem.free)))
     example = jax.eval_shape(make_evaluate(problem), genomes, jax.random.key(0))
     with RunFolder.open(folder, config, cluster) as run:
@@ -72,8 +75,8 @@ def optimize(config: Config, folder: Path, console: Console, cluster: Cluster, l
             try:
                 steps = search.run(plan, evaluate, begun, best)
                 for state, generation in iter(partial(cluster.interruptible, partial(next, steps, None)), None):
-                    run.append(vars(generation))
-                    show(vars(generation))
+                    run.append(generation.record())
+                    show(generation.record())
                     run.save_if_due(state, int(state.generation))
                     console.progress(pace.progress(generation))
                     cluster.raise_if_preempted(int(state.generation))
@@ -99,9 +102,14 @@ def optimize(config: Config, folder: Path, console: Console, cluster: Cluster, l
             pairs = refine_elites(refinement, best_first, REFINABLE, again, console, partial_state)
             by_volume = sorted(pairs, key=lambda pair: float(cost(pair[0], config.search)))
             best_first, refinements = zip(*by_volume, strict=True)
-        elites, reported = again.report(best_first, initial)
-        elites = [each._replace(refinement=record) for each, record in zip(elites, refinements, strict=True)]
-        cluster.on_first(lambda: _store(problem, elites, reported, run, console))
+        of_tasks = zip(*map(parts_of, (*best_first, initial)), strict=True)
+        reports = [again.report(elites, last) for *elites, last in of_tasks]
+        if problem.tasks:
+            cluster.on_first(lambda: _store_several(problem, best_first, initial, reports, run, console))
+        else:
+            ((elites, reported),) = reports
+            elites = [each._replace(refinement=record) for each, record in zip(elites, refinements, strict=True)]
+            cluster.on_first(lambda: _store(problem, elites, reported, run, console))
         partial_state.close()
         return True
 
@@ -145,18 +153,18 @@ def _volume(value: float) -> str:
     return "none" if math.isnan(value) else f"{value:.5g}"
 
 
-def _filled(elites: Elites) -> list[Evaluation]:
+def _filled(elites: Elites) -> list[Any]:
     records = jax.device_get(elites.evaluation)
     return [row(records, k) for k in range(int(elites.count))]
 
 
-def _stacked(evaluations: list[Evaluation], elites: Elites) -> Evaluation:
+def _stacked(evaluations: list[Any], elites: Elites) -> Any:
     """As many records as the archive has slots; what stands in the empty ones does not matter."""
     rows = [*evaluations, *evaluations[-1:] * (len(elites.costs) - len(evaluations))]
     return jax.tree.map(lambda *leaves: np.stack(leaves), *rows)
 
 
-def _initial(problem: Problem, evaluate: Callable[..., Sharded]) -> Evaluation:
+def _initial(problem: Problem, evaluate: Callable[..., Sharded]) -> Any:
     genome = np.asarray(initial_genome(problem))
     return row(evaluate(genome[None], jax.random.key(0)).take(np.array([0])), 0)
 
@@ -166,11 +174,45 @@ def _store(problem: Problem, elites: Sequence[Reported], initial: Reported, run:
     run.write_elites((arrays_of(problem, elite.evaluation), record_of(problem, *elite)) for elite in elites)
     run.tell_time()
     run.write_initial(arrays_of(problem, initial.evaluation), record_of(problem, *initial))
+    _tell(problem, elites, initial, console)
+    console.message(f"{len(elites)} elites in {run.path}")
+
+
+def _store_several(
+    problem: Problem, elites: Sequence[TaskEvaluations], initial: TaskEvaluations,
+    reports: Sequence[tuple[Sequence[Reported], Reported]], run: RunFolder, console: Console,
+) -> None:  # fmt: skip
+    """Every task's elites and initial candidate in a folder of its own, what they have in common in the run folder."""
+    run.tell_time()
+    for name, alone, (of_task, first) in zip(problem.config.tasks, problem.tasks, reports, strict=True):
+        console.message(f"task {name}:")
+        _tell(alone, of_task, first, console)
+        stored = [(arrays_of(alone, each.evaluation), record_of(alone, *each)) for each in (*of_task, first)]
+        store_task(run.path, name, alone.config, stored[:-1], stored[-1])
+    run.write_elites((common_arrays(each), common_record(problem, each)) for each in elites)
+    run.write_initial(common_arrays(initial), common_record(problem, initial))
+    for line in _over_tasks(problem, initial, elites[0]):
+        console.message(line)
+    console.message(f"{len(elites)} elites in {run.path}, and each task's in a folder of {run.path / TASKS}")
+
+
+def _over_tasks(problem: Problem, initial: TaskEvaluations, best: TaskEvaluations) -> Iterator[str]:
+    """The searched volume of the initial and the best candidate on every task and over them."""
+    search = problem.config.search
+    yield f"{f'{search.objective} (sampled)':24}{'initial':>12}{'best':>12}{'ratio':>9}"
+    each = [evaluation.tasks.volumes[search.objective] for evaluation in (initial, best)]
+    rows = list(zip(problem.config.tasks, *each, strict=True))
+    rows.append((search.over_tasks, *(evaluation.volumes[search.objective] for evaluation in (initial, best))))
+    for name, first, last in rows:
+        ratio = f"{last / first:9.2f}" if first > 0 else f"{'-':>9}"
+        yield f"{name:24}{float(first):12.5g}{float(last):12.5g}{ratio}"
+
+
+def _tell(problem: Problem, elites: Sequence[Reported], initial: Reported, console: Console) -> None:
     for line in summary(problem, initial, elites[0]):
         console.message(line)
     if compared := [reported.physics for reported in (*elites, initial) if reported.physics is not None]:
         console.message(physics_line(compared))
-    console.message(f"{len(elites)} elites in {run.path}")
 
 
 def summary(problem: Problem, initial: Reported, best: Reported) -> Iterator[str]:

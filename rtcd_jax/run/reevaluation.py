@@ -11,14 +11,16 @@ from typing import Any, Generic, NamedTuple, TypeVar, final
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 
-from rtcd_jax.evaluation import compare_with_mjx, elite_budget, elite_key, resample
+from rtcd_jax.evaluation import compare_with_mjx, elite_budget, elite_key, over_tasks, resample
 from rtcd_jax.problem import Problem
+from rtcd_jax.search.archive import Records
 from rtcd_jax.system.cluster import Cluster
 from rtcd_jax.system.console import Console
 from rtcd_jax.system.errors import UserError
-from rtcd_jax.types import Evaluation, Status
+from rtcd_jax.types import Evaluation, Status, TaskEvaluations
 from rtcd_jax.validation import PhysicsComparison
 
 TOLERANCE = 1e-6
@@ -27,6 +29,14 @@ TOLERANCE = 1e-6
 Job = tuple[Evaluation, jax.Array, int]
 """A candidate, its random numbers, and its held-out samples at each knot."""
 Result = TypeVar("Result")
+Record = TypeVar("Record", Evaluation, TaskEvaluations)
+
+
+def parts_of(evaluation: Records) -> list[Evaluation]:
+    """A candidate's evaluation on each of its tasks."""
+    if not isinstance(evaluation, TaskEvaluations):
+        return [evaluation]
+    return [row(evaluation.tasks, task) for task in range(len(evaluation.tasks.status))]
 
 
 @final
@@ -43,26 +53,41 @@ class Reported(NamedTuple):
 class Reevaluation:
     """Its programs compile beside the search's own, from when this is made. All methods raise Preempted.
 
-    Rollouts ask for S at the knots alone: a policy's `value_rates` are left out of the programs.
+    Rollouts ask for S at the knots alone: a policy's `value_rates` are left out of the programs. Of several tasks each
+    is evaluated alone, by the same programs.
     """
 
-    def __init__(self, problem: Problem, cluster: Cluster, population: Evaluation, console: Console):
-        self._elites, self._key = problem.config.elites, elite_key()
+    def __init__(self, problem: Problem, cluster: Cluster, population: Records, console: Console):
+        self._problem, self._elites, self._key = problem, problem.config.elites, elite_key()
+        if isinstance(population, TaskEvaluations):  # one candidate's on all tasks are a population, too
+            one = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape[1:], leaf.dtype), population.tasks)
+        else:
+            one = population
         self._cluster, self._console = cluster, console
         self._checks = problem.config.search.generations
         self._budget = elite_budget(problem)
-        population = _with_rates(population, None)
-        self._resample = _OnDevices(partial(resample, problem, self._budget), cluster, population)
+        blank = _with_rates(one, None)
+        self._resample = _OnDevices(partial(resample, problem, elite_budget), cluster, blank)
         if self._elites.mjx_states:
             compare = lambda evaluation, key, _: compare_with_mjx(problem, evaluation, key)  # noqa: E731
-            self._compare = _OnDevices(compare, cluster, population)
+            self._compare = _OnDevices(compare, cluster, blank)
 
-    def sample(self, evaluations: Sequence[Evaluation]) -> list[Evaluation]:
-        """Each with its funnel sampled again, all by the same random numbers."""
-        jobs = [(evaluation, self._key, self._budget.samples_per_knot) for evaluation in evaluations]
+    def sample(self, evaluations: Sequence[Record]) -> list[Record]:
+        """Each with its funnels sampled again, all by the same random numbers."""
+        parts = [part for evaluation in evaluations for part in parts_of(evaluation)]
+        jobs = [(part, self._key, self._budget.samples_per_knot) for part in parts]
         results = self._resample(jobs, self._tell("funnels sampled again", len(jobs)))
-        rates = [evaluation.funnel.policy.value_rates for evaluation in evaluations]
-        return [_with_rates(result, each) for result, each in zip(results, rates, strict=True)]
+        rates = [part.funnel.policy.value_rates for part in parts]
+        sampled = [_with_rates(result, each) for result, each in zip(results, rates, strict=True)]
+        tasks = max(1, len(self._problem.tasks))
+        return [self._whole(sampled[k : k + tasks]) for k in range(0, len(sampled), tasks)]
+
+    def _whole(self, parts: Sequence[Evaluation]) -> Any:
+        """The inverse of `parts_of`, on the host."""
+        if not self._problem.tasks:
+            return parts[0]
+        stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *parts)
+        return jax.device_get(over_tasks(stacked, self._problem.config.search.over_tasks))
 
     def report(self, elites: Sequence[Evaluation], initial: Evaluation) -> tuple[list[Reported], Reported]:
         """What is stored of the elites, best first, and of the initial candidate.

@@ -21,7 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from rtcd_jax.config.schema import SearchConfig
-from rtcd_jax.elite.records import Arrays, Record, read_config, read_elite, require_elites, write_elite
+from rtcd_jax.elite.records import Arrays, Record, read_config, read_elite, require_elites, task_of, write_elite
 from rtcd_jax.numerics.loops import on_gpu
 from rtcd_jax.problem import Problem, make_problem
 from rtcd_jax.refinement import AGREEMENT, Refinement, State
@@ -31,6 +31,7 @@ from rtcd_jax.run.reevaluation import Reevaluation, Reported, row
 from rtcd_jax.search.archive import cost
 from rtcd_jax.system.cluster import Cluster
 from rtcd_jax.system.console import Clock, Console, Progress, table
+from rtcd_jax.system.errors import UserError
 from rtcd_jax.system.files import make_folder, replace, writing
 from rtcd_jax.types import Evaluation, Policy, Status
 from rtcd_jax.volume import VOLUMES, Knots
@@ -55,6 +56,8 @@ def refine_run(folder: Path, elites: int, free: tuple[str, ...], steps: int, con
         UserError: no run folder, a run without elites or one that is in use, or files that cannot be read or written.
     """
     config = read_config(folder)
+    if len(config.tasks) > 1 or task_of(folder):
+        raise UserError(f"{folder} is for several tasks: an elite is refined for one, and would lose its place in them")
     with locked(folder):
         _finish_exchange(folder)
         stored = {name: read_elite(folder / "elites", name) for name in require_elites(folder)}

@@ -8,7 +8,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any, cast, final
+from typing import Any, NamedTuple, cast, final
 
 import jax
 import jax.numpy as jnp
@@ -16,12 +16,19 @@ import numpy as np
 from jaxtyping import Array, Float, Int, Key
 
 from rtcd_jax.evaluation import Evaluate
-from rtcd_jax.search.archive import where
+from rtcd_jax.search.archive import Records, where
 from rtcd_jax.system.cluster import Cluster
-from rtcd_jax.types import Evaluation, Volumes
+from rtcd_jax.types import Volumes
 
 POLL = 0.01
 """Seconds between two looks at whether a chunk is done."""
+
+
+class TaskOutcomes(NamedTuple):
+    """Statuses and volumes, but for those of the knots, on every one of several tasks."""
+
+    status: Int[Array | np.ndarray, "P T"]
+    volumes: Volumes
 
 
 @final
@@ -34,10 +41,11 @@ class Sharded:
     status: Int[np.ndarray, " P"]
     volumes: Volumes
     borne: Float[np.ndarray, " P"] | None
-    _parts: tuple[Evaluation, ...]
-    _fetch: Callable[[Evaluation, np.ndarray], Evaluation]
+    tasks: TaskOutcomes | None
+    _parts: tuple[Records, ...]
+    _fetch: Callable[[Records, np.ndarray], Records]
 
-    def take(self, rows: Int[np.ndarray, " E"]) -> Evaluation:
+    def take(self, rows: Int[np.ndarray, " E"]) -> Records:
         """The whole records [E] of these candidates, in numpy."""
         size = self._parts[0].status.shape[0]
         first, *others = np.unique(rows // size)
@@ -67,29 +75,36 @@ def sharded(
         whole = cluster.replicated(jax.random.key_data(key))
         parts = [on_devices(cluster.split(part), whole) for part in np.split(padded, len(padded) // size)]
         summaries = [_summary(cluster, part) for part in parts]
-        status, volumes, borne = jax.tree.map(lambda *leaves: np.concatenate(leaves)[:count], *summaries)
-        return Sharded(genomes, status, volumes, borne, tuple(parts), fetch)
+        status, volumes, borne, tasks = jax.tree.map(lambda *leaves: np.concatenate(leaves)[:count], *summaries)
+        return Sharded(genomes, status, volumes, borne, tasks, tuple(parts), fetch)
 
     return evaluate_all
 
 
-def _summary(cluster: Cluster, part: Evaluation) -> tuple[np.ndarray, Volumes, np.ndarray | None]:
-    """Statuses, volumes but those of the knots, and what is borne, on the host as soon as the chunk is done."""
+def _summary(cluster: Cluster, part: Records) -> tuple[np.ndarray, Volumes, np.ndarray | None, TaskOutcomes | None]:
+    """Statuses, volumes but those of the knots, what is borne, outcomes on several tasks: on the host as soon as the
+    chunk is done.
+    """
     done = cast(Any, part.status).is_ready
     while not done():
         time.sleep(POLL)
     cluster.raise_if_preempted()
-    volumes = replace(part.volumes, per_knot=part.volumes.per_knot[:, :0])
-    return cluster.gathered((part.status, volumes, part.borne))
+    each = part.tasks
+    tasks = None if each is None else TaskOutcomes(each.status, _of_the_whole(each.volumes))
+    return cluster.gathered((part.status, _of_the_whole(part.volumes), part.borne, tasks))
 
 
-def _rows(chunk: int, part: Evaluation, wanted: Int[Array, " E"]) -> Evaluation:
+def _of_the_whole(volumes: Volumes) -> Volumes:
+    return replace(volumes, per_knot=volumes.per_knot[..., :0])
+
+
+def _rows(chunk: int, part: Records, wanted: Int[Array, " E"]) -> Records:
     """On one device: its own candidates among the wanted ones, anything for the others."""
     inside = jnp.clip(wanted - chunk * jax.lax.axis_index("candidates"), 0, chunk - 1)
     return jax.tree.map(lambda leaf: leaf[inside], part)
 
 
-def _fetch(cluster: Cluster, rows: Callable, chunk: int, part: Evaluation, wanted: Int[np.ndarray, " E"]) -> Evaluation:
+def _fetch(cluster: Cluster, rows: Callable, chunk: int, part: Records, wanted: Int[np.ndarray, " E"]) -> Records:
     """The wanted records of a part, whose device is known by their place."""
     records = cluster.gathered(rows(part, cluster.replicated(wanted)))
     devices, count = len(cluster.devices), len(wanted)

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from rtcd_jax.config.schema import SearchConfig
-from rtcd_jax.types import Evaluation, Status, Volumes
+from rtcd_jax.types import Evaluation, Status, TaskEvaluations, Volumes
 
 FAILED = 1e3
 """Graded cost of a candidate that bears the uncertainty at all knots but one, more than any that has a funnel."""
@@ -18,8 +18,26 @@ TOO_SMALL = 500.0
 """Cost of a candidate that lacks next to nothing of `search.at_least`, more than any -log(volume)."""
 
 
+TIE = 1e-9
+"""Share of the mean over the tasks in the cost of the smallest volume: it decides between equals alone."""
+
+Records = Evaluation | TaskEvaluations
+"""Of one task or of several."""
+
+
+class Outcomes(Protocol):
+    """What a population [P] is worth on every one of T tasks."""
+
+    @property
+    def volumes(self) -> Volumes: ...
+    @property
+    def status(self) -> Int[Array | np.ndarray, "P T"]: ...
+
+
 class Evaluated(Protocol):
-    """A population's evaluation, wherever its records are: an Evaluation, or one that is sharded over devices."""
+    """A population's evaluation, wherever its records are: `Records`, or one that is sharded over devices; `tasks` is
+    None where there is one.
+    """
 
     @property
     def genome(self) -> Float[Array | np.ndarray, "P d"]: ...
@@ -29,8 +47,10 @@ class Evaluated(Protocol):
     def status(self) -> Int[Array | np.ndarray, " P"]: ...
     @property
     def borne(self) -> Float[Array | np.ndarray, " P"] | None: ...
+    @property
+    def tasks(self) -> Outcomes | None: ...
 
-    def take(self, rows: np.ndarray, /) -> Evaluation:
+    def take(self, rows: np.ndarray, /) -> Records:
         """The whole records of the candidates at `rows` [E]."""
         ...
 
@@ -42,7 +62,7 @@ class Elites(eqx.Module):
     `generations` are those in which the elites were evaluated, -1 in an empty slot.
     """
 
-    evaluation: Evaluation
+    evaluation: Records
     costs: Float[Array, " E"]
     generations: Int[Array, " E"]
 
@@ -56,10 +76,14 @@ def cost(evaluation: Evaluated, search: SearchConfig) -> Float[Array, "*P"]:
 
     The logarithm keeps the order, and makes the penalty at the box independent of the volume's unit. A candidate below
     what `search.at_least` demands comes after all that are not, and the later the larger the mean of its shortfalls.
+    Of the smallest volume over several tasks, which is flat in the others, their geometric mean breaks ties.
     """
     value = jnp.asarray(evaluation.volumes[search.objective], jnp.float64)
     feasible = (evaluation.status == Status.OK) & jnp.isfinite(value) & (value > 0)
     costs = jnp.where(feasible, -jnp.log(jnp.where(feasible, value, 1.0)), jnp.inf)
+    if evaluation.tasks is not None and search.over_tasks == "min":
+        each = jnp.asarray(evaluation.tasks.volumes[search.objective], jnp.float64)
+        costs -= TIE * jnp.log(jnp.where(feasible[..., None], each, 1.0)).mean(-1)
     if not search.at_least:
         return costs
     lacking = shortfall(evaluation, search)
@@ -67,8 +91,15 @@ def cost(evaluation: Evaluated, search: SearchConfig) -> Float[Array, "*P"]:
 
 
 def shortfall(evaluation: Evaluated | Evaluation, search: SearchConfig) -> Float[Array, "*P"]:
-    """Mean share that a candidate lacks of what `search.at_least` demands: 0 where it has all, 1 without a funnel."""
-    lacking = [1 - jnp.asarray(evaluation.volumes[name]) / least for name, least in search.at_least.items()]
+    """Mean share that a candidate lacks of what `search.at_least` demands: 0 where it has all, 1 without a funnel; of
+    several tasks in the worst one.
+    """
+    tasks = evaluation.tasks
+    volumes = {
+        name: jnp.asarray(evaluation.volumes[name]) if tasks is None else jnp.asarray(tasks.volumes[name]).min(-1)
+        for name in search.at_least
+    }
+    lacking = [1 - volumes[name] / least for name, least in search.at_least.items()]
     return jnp.mean(jnp.clip(jnp.stack(lacking), 0, 1), axis=0) if lacking else jnp.zeros(evaluation.status.shape)
 
 
@@ -84,7 +115,7 @@ def graded_cost(evaluation: Evaluated, search: SearchConfig) -> Float[Array, "*P
     return jnp.where(estimated, FAILED * (2 - evaluation.borne), costs)
 
 
-def empty(capacity: int, example: Evaluation) -> Elites:
+def empty(capacity: int, example: Records) -> Elites:
     """An archive without elites. `example` is a population's evaluation (arrays or their shapes, leading axis P)."""
     if capacity < 1:
         raise ValueError(f"an archive holds at least 1 elite, got {capacity}")

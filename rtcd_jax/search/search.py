@@ -11,7 +11,7 @@ All randomness of a generation is fold_in(key(seed), index): the same state alwa
 
 import dataclasses
 import functools
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple, Protocol, Self, final
 
 import equinox as eqx
@@ -23,11 +23,11 @@ from jaxtyping import Array, Float, Int, Key
 from rtcd_jax.config.schema import ElitesConfig, SearchConfig
 from rtcd_jax.search import archive as elites
 from rtcd_jax.search import cmaes
-from rtcd_jax.search.archive import Elites, Evaluated
+from rtcd_jax.search.archive import Elites, Evaluated, Records
 from rtcd_jax.search.cmaes import Stop
 from rtcd_jax.search.nesting import Joint, Nested, NestedState
 from rtcd_jax.system.errors import UserError
-from rtcd_jax.types import Evaluation, Status
+from rtcd_jax.types import Status
 
 Evaluate = Callable[[Float[Array, "P d"], Key[Array, ""]], Evaluated]
 
@@ -51,7 +51,8 @@ class NothingFeasible(UserError):
 @final
 @dataclasses.dataclass(frozen=True)
 class Plan:
-    """What is fixed during a search. `initial` is the first genome, `design` tells its design entries from weights.
+    """What is fixed during a search. `initial` is the first genome, `design` tells its design entries from weights;
+    `tasks` are the names of several.
 
     Raises ValueError if the initial genome is empty or outside the unit box, or if nested loops lack a design
     variable or a weight.
@@ -61,6 +62,7 @@ class Plan:
     elites: ElitesConfig
     initial: tuple[float, ...]
     design: tuple[bool, ...]
+    tasks: tuple[str, ...] = ()
 
     def __post_init__(self):
         if len(self.design) != len(self.initial):
@@ -95,7 +97,8 @@ class Generation:
     `volumes` are [P] each by the objectives' names; `best` (that ranks first) and `median` (over the feasible) are
     those of `objective` in this generation, `best_so_far` that of the archive (all sampled); `feasible` is a share,
     `counts` and `stops` leave out what did not occur; `sigma` is the (outer) population's standard deviation along its
-    widest axis [box widths], `evaluations` and `restarts` count from the search's start.
+    widest axis [box widths], `evaluations` and `restarts` count from the search's start. Of several tasks `volumes` are
+    those over them, and `tasks` has, by name, each one's `volumes` and `statuses` [P].
     """
 
     index: int
@@ -112,9 +115,14 @@ class Generation:
     genomes: np.ndarray
     statuses: np.ndarray
     volumes: dict[str, np.ndarray]
+    tasks: Mapping[str, Mapping[str, Any]] = dataclasses.field(default_factory=dict)
+
+    def record(self) -> dict[str, Any]:
+        """As generations.jsonl has it; `tasks` where there are several."""
+        return {key: value for key, value in vars(self).items() if key != "tasks" or value}
 
 
-def start(plan: Plan, example: Evaluation) -> SearchState:
+def start(plan: Plan, example: Records) -> SearchState:
     """The state before generation 0. `example` is an evaluated population of any size, or its shapes."""
     zero = jnp.zeros((), jnp.int32)
     return SearchState(
@@ -177,7 +185,7 @@ def run(
         yield state, generation
 
 
-def finish(plan: Plan, state: SearchState, evaluation: Evaluation) -> Elites:
+def finish(plan: Plan, state: SearchState, evaluation: Records) -> Elites:
     """The elites by their second `evaluation` [E], slot by slot, sorted anew; those that failed it are dropped.
 
     A sampled volume that won among thousands is likely to have been lucky: only the second one may be reported.
@@ -231,14 +239,27 @@ class _Summary(NamedTuple):
     statuses: np.ndarray
     costs: np.ndarray
     volumes: dict[str, np.ndarray]
+    tasks: tuple[np.ndarray, dict[str, np.ndarray]] | None
 
     @classmethod
     def of(cls, evaluation: Evaluated, settings: SearchConfig) -> Self:
-        volumes = evaluation.volumes.named
+        volumes, tasks = evaluation.volumes.named, evaluation.tasks
         costs = elites.cost(evaluation, settings)
-        summary = cls(*jax.device_get((evaluation.genome, evaluation.status, costs, volumes)))
+        each = None if tasks is None else (tasks.status, tasks.volumes.named)
+        summary = cls(*jax.device_get((evaluation.genome, evaluation.status, costs, volumes, each)))
         feasible = np.isfinite(summary.costs)
         return summary._replace(volumes={name: np.where(feasible, v, np.nan) for name, v in summary.volumes.items()})
+
+    def of_tasks(self, names: Sequence[str]) -> dict[str, dict[str, Any]]:
+        """Volumes and statuses [P] of each task by name; volumes are NaN where a candidate failed in it."""
+        if self.tasks is None:
+            return {}
+        statuses, volumes = self.tasks
+        volumes = {key: np.where(statuses == Status.OK, value, np.nan) for key, value in volumes.items()}
+        return {
+            name: {"statuses": statuses[:, t], "volumes": {key: value[:, t] for key, value in volumes.items()}}
+            for t, name in enumerate(names)
+        }
 
 
 def _record(plan: Plan, after: SearchState, summary: _Summary, stops: np.ndarray) -> Generation:
@@ -262,4 +283,5 @@ def _record(plan: Plan, after: SearchState, summary: _Summary, stops: np.ndarray
         genomes=summary.genomes,
         statuses=summary.statuses,
         volumes=summary.volumes,
+        tasks=summary.of_tasks(plan.tasks),
     )

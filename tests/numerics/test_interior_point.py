@@ -37,12 +37,13 @@ def stage(x, u, h, parameters, substeps=4):
     return rk4(lambda x, u: rate(x, u, parameters), x, u, h, substeps), h * running(x, u, parameters)
 
 
+START, GOAL = np.zeros(2), np.array([1.0, 0.0])
 CART = ControlProblem(
     interval=lambda *arguments: stage(*arguments)[0],
     rate=rate,
     running=running,
-    start=np.zeros(2),
-    goal=np.array([1.0, 0.0]),
+    ends=lambda _: (START, GOAL),
+    travel=GOAL - START,
     state_limits=np.array([np.inf, SPEED]),
     input_limits=np.array([FORCE]),
     step_limits=STEPS,
@@ -91,7 +92,7 @@ def test_the_least_effort_is_the_shortest_solution_of_the_end_conditions(solutio
     """Without a price on time the step is the longest, and u the pseudo-inverse of the linear map to the end state."""
     h = STEPS[1]
     to_end = np.stack([h**2 * (N - 0.5 - np.arange(N)), np.full(N, h)])
-    exact = np.linalg.pinv(to_end) @ CART.goal
+    exact = np.linalg.pinv(to_end) @ GOAL
     np.testing.assert_allclose(solution.h[FRUGAL], h, rtol=1e-4)
     np.testing.assert_allclose(solution.us[:, 0, FRUGAL, 0], exact, atol=1e-3 * np.max(exact))
     np.testing.assert_allclose(solution.cost[FRUGAL], 0.5 * h * exact @ exact, rtol=1e-4)
@@ -103,7 +104,7 @@ def dense_optimum(index):
 
     def unpack(z):
         inner = z[: 2 * (N - 1)].reshape(N - 1, 2)
-        xs = jnp.concatenate([CART.start[None], inner, CART.goal[None]])
+        xs = jnp.concatenate([START[None], inner, GOAL[None]])
         return xs, z[2 * (N - 1) : -1][None], z[-1]
 
     def simulate(z):
@@ -150,7 +151,7 @@ def test_solutions_are_inside_the_boxes_with_exact_ends(solution):
     assert np.all(np.abs(solution.xs[1:-1, 1, finite]) < SPEED)
     assert np.all(np.abs(solution.us[..., finite, :]) < FORCE)
     assert np.all((solution.h[finite] > STEPS[0]) & (solution.h[finite] < STEPS[1]))
-    for end, pinned in ((0, CART.start), (-1, CART.goal)):
+    for end, pinned in ((0, START), (-1, GOAL)):
         np.testing.assert_array_equal(solution.xs[end], np.broadcast_to(pinned[:, None, None], (2, 6, 2)))
 
 

@@ -119,7 +119,7 @@ def test_lines_after_the_saved_generation_and_a_torn_one_are_cut(tmp_path, gener
     plan = plan_of(config)
     with RunFolder.open(tmp_path / "torn", config) as folder:
         for state, record in search.run(plan, bowl, folder.restore(begin(plan))):
-            folder.append(vars(record))
+            folder.append(record.record())
             if record.index + 1 == generations:
                 folder.save(state, generations)
     with (tmp_path / "torn" / "generations.jsonl").open("ab") as file:
@@ -345,7 +345,7 @@ def test_a_lock_without_a_name_is_still_a_lock(tmp_path):
 @pytest.mark.parametrize(
     ("content", "message"),
     [
-        ('{"format": "rtcd_jax run", "version": 2}', "version 2, but this rtcd_jax reads 'rtcd_jax run', version 1"),
+        ('{"format": "rtcd_jax run", "version": 3}', "version 3, but this rtcd_jax reads 'rtcd_jax run', version 1"),
         ('{"format": "other", "version": 1}', "says 'other'"),
         ('{"version": 1}', "says None, version 1, but this"),
     ],
@@ -395,7 +395,7 @@ def at_generations(path, *saved):
     plan = plan_of(config)
     with RunFolder.open(path, config) as folder:
         for state, record in search.run(plan, bowl, folder.restore(begin(plan))):
-            folder.append(vars(record))
+            folder.append(record.record())
             if record.index + 1 in saved:
                 folder.save(state, record.index + 1)
     return config, plan

@@ -59,7 +59,7 @@ def drive(path, config, seconds=0.0, cluster=None):
         try:
             for state, record in search.run(plan, evaluate, begun):
                 time.sleep(seconds)
-                folder.append(vars(record))
+                folder.append(record.record())
                 print("generation", record.index, flush=True)
                 folder.save_if_due(state, int(state.generation))
                 cluster.raise_if_preempted(int(state.generation))

@@ -34,6 +34,7 @@ from rtcd_jax.analysis.report.reading import (
 from rtcd_jax.analysis.report.robot import robots_of
 from rtcd_jax.analysis.report.traces import Plot, legend, plots_of
 from rtcd_jax.analysis.report.words import duration, guarantee, ratio, volume_unit, words
+from rtcd_jax.elite.records import task_folders
 from rtcd_jax.system.console import Console
 from rtcd_jax.system.errors import UserError
 from rtcd_jax.system.files import replace
@@ -49,6 +50,7 @@ def report(folders: Sequence[Path], to: Path | None = None, console: Console | N
 
     Certificates that were not checked yet are checked first, and `console` shows how far that is.
 
+    One run for several tasks: a page for each task in its folder, and the tasks compared in the run's `report.html`.
     One run: `report.html` and `figures/` in its folder. Several: `comparison.html` beside the first folder, with
     `comparison.png` and `.pdf`. `to`, say NAME.html, is another path for the page; then one run's figures are in
     NAME_figures/ beside it, and the run's folder is only read.
@@ -56,9 +58,12 @@ def report(folders: Sequence[Path], to: Path | None = None, console: Console | N
     Raises:
         UserError: a folder that is no finished run's, runs of different robots, or a path that cannot be written.
     """
-    runs = [read_run(folder, console) for folder in folders]
     if to is not None and to.is_dir():
         raise UserError(f"--to = {to}: must be a file, and this is a folder")
+    if len(folders) == 1 and (tasks := task_folders(folders[0])) != list(folders):
+        pages = [] if to else [path for task in tasks for path in report([task], console=console)]
+        return report(tasks, to or folders[0] / "report.html", console) + pages
+    runs = [read_run(folder, console) for folder in folders]
     if len(runs) == 1:
         (run,), page = runs, to or folders[0] / "report.html"
         drawn = draw_figures(dataclasses.replace(run, figures=to.with_name(f"{to.stem}_figures")) if to else run)
@@ -75,10 +80,14 @@ def refresh(folder: Path, console: Console | None = None) -> Path | None:
 
     The figures beside it show none of that, and stay. Raises UserError as `report`.
     """
-    page = folder / "report.html"
+    page, tasks = folder / "report.html", task_folders(folder)
+    for task in tasks:
+        if task != folder:
+            refresh(task, console)
     if not page.is_file():
         return None
-    replace(page, render([read_run(folder, console)]).encode())
+    runs = [read_run(task, console) for task in tasks]
+    replace(page, render(runs if len(runs) == 1 else compared(runs)).encode())
     return page
 
 

@@ -58,7 +58,7 @@ def measure(path: Path, population: int, devices: int, repeats: int) -> dict[str
     with tempfile.TemporaryDirectory() as folder, RunFolder.open(Path(folder) / "run", config, cluster) as run:
         for _ in range(repeats + 1):
             (state, generation), step = timed(lambda state=state: search.step(plan, evaluate, state))
-            _, write = timed(lambda generation=generation: run.append(vars(generation)))
+            _, write = timed(lambda generation=generation: run.append(generation.record()))
             steps.append(step)
             writes.append(write)
         run.save(state, repeats)

@@ -43,10 +43,10 @@ def solve(
     allowance: Int[Array, " P"],
     settings: Settings = DEFAULTS,
 ) -> Solution:
-    """Solve every problem of the batch from one guess, within `allowance` iterations.
+    """Solve every problem of the batch, within `allowance` iterations.
 
-    `parameters` is a pytree with P on the last axis of every leaf; so do the solutions come back. The guess has no
-    batch. A problem whose allowance is zero costs nothing; all that is said of it is that it is not solved.
+    `parameters` is a pytree with P on the last axis of every leaf; so do the solutions come back. The guess has
+    one of P, or none. A problem whose allowance is zero costs nothing; all that is said of it is that it is not solved.
     """
     count = allowance.shape[0]
     model = Model(problem, guess.xs.dtype)
@@ -57,7 +57,10 @@ def solve(
     def load(indices):
         rows = order[indices]
         chosen = jax.tree.map(lambda leaf: leaf[..., rows], parameters)
-        start = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf[..., None], (*leaf.shape, *rows.shape)), guess)
+        if guess.h.ndim:
+            start = jax.tree.map(lambda leaf: leaf[..., rows], guess)
+        else:
+            start = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf[..., None], (*leaf.shape, *rows.shape)), guess)
         return method.initial(start, chosen), chosen, allowance[rows]
 
     def advance(state):

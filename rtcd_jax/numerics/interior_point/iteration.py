@@ -31,9 +31,10 @@ class Iteration:
     def initial(self, guess: Guess, parameters: PyTree) -> Iterate:
         batch = guess.h.shape[-1]
         inside = jax.tree.map(push_inside, self.model.values(*guess), self.model.lower, self.model.upper)
-        pinned = lambda a: jnp.broadcast_to(jnp.asarray(a, self.model.dtype)[:, None], (self.model.n, batch))  # noqa: E731
+        ends = (jnp.asarray(end, self.model.dtype) for end in self.model.problem.ends(parameters))
+        start, goal = (jnp.broadcast_to(end.reshape(self.model.n, -1), (self.model.n, batch)) for end in ends)
         xs = guess.xs.at[1:-1, self.model.boxed].set(inside.xs)
-        xs = xs.at[0].set(pinned(self.model.problem.start)).at[-1].set(pinned(self.model.problem.goal))
+        xs = xs.at[0].set(start).at[-1].set(goal)
         full = lambda value: jnp.full((batch,), value, self.model.dtype)  # noqa: E731
         barrier = full(self.settings.barrier_start)
         zero = jnp.zeros((batch,), jnp.int32)

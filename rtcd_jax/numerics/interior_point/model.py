@@ -18,7 +18,7 @@ class Model:
 
     def __init__(self, problem: ControlProblem, dtype: DTypeLike):
         self.problem, self.dtype = problem, dtype
-        self.n, self.m = len(problem.start), len(problem.input_limits)
+        self.n, self.m = len(problem.state_limits), len(problem.input_limits)
         self.boxed = np.flatnonzero(np.isfinite(problem.state_limits))
         x_limit = problem.state_limits[self.boxed]
         low, high = problem.step_limits
@@ -26,7 +26,7 @@ class Model:
         as_column = lambda a: jnp.asarray(np.asarray(a, float), dtype)[:, None]  # noqa: E731
         self.lower = Boxed(as_column(-x_limit), as_column(-problem.input_limits), as_column([low] * self.free_step))
         self.upper = Boxed(as_column(x_limit), as_column(problem.input_limits), as_column([high] * self.free_step))
-        travel = np.maximum(1.0, np.abs(problem.start - problem.goal))
+        travel = np.maximum(1.0, problem.travel)
         scale_x = np.where(np.isfinite(problem.state_limits), problem.state_limits, travel)
         self.scaling = [float(s) for s in (*1 / scale_x**2, 0.0, *1 / problem.input_limits**2)]
         self.step_scaling = 4 / (high - low) ** 2 if self.free_step else 0.0

@@ -34,6 +34,7 @@ DEFAULTS = Settings()
 class ControlProblem(NamedTuple):
     """What to solve. The functions work elementwise on trailing axes.
 
+    `ends(parameters)` are x_0 and x_N, [n] or [n P]; `travel` is the largest distance between them in each state.
     `interval(x [n ..], u [m ..], h, parameters)` is the next x, `running(x, u, parameters)` the cost per time of an
     interval, `rate(x, u, parameters)` the time derivative of x, both of tuples x and u of components. Derivatives are
     taken of one Runge-Kutta step of `rate`, a cheaper integration of the same dynamics. Its error decides how fast the
@@ -44,8 +45,8 @@ class ControlProblem(NamedTuple):
     interval: Callable
     rate: Callable
     running: Callable
-    start: np.ndarray
-    goal: np.ndarray
+    ends: Callable
+    travel: np.ndarray
     state_limits: np.ndarray
     input_limits: np.ndarray
     step_limits: tuple[float, float]
