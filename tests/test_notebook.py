@@ -28,6 +28,6 @@ def test_the_notebook_runs(tmp_path, monkeypatch):
     book = nbformat.read(NOTEBOOK, as_version=4)
     client.NotebookClient(book, timeout=1800, resources={"metadata": {"path": str(tmp_path)}}).execute()
     said = "".join(output.get("text", "") for cell in book.cells for output in cell.get("outputs", []))
-    for sentence in ("2 elites in runs/smoke", "proved", "demo.svg", "sampled sum"):
+    for sentence in ("2 elites in runs/smoke", "proved", "demo.svg", "sampled sum", "wide to each side"):
         assert sentence in said
     assert (tmp_path / "runs" / "smoke" / "report.html").is_file()

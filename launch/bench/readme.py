@@ -25,18 +25,19 @@ Rows = Iterator[tuple[str, ...]]
 
 
 def label(run: Run) -> str:
-    """`pendulum RTC-D, with mass and length`: the robot, what is searched beside the weights, another objective."""
+    """``pendulum_rtcd`: RTC-D, mass, length`: the run's name, what is searched beside the weights, what is special."""
     config = run.config
     free = [words(name) for name, variable in config.design.items() if variable.free]
-    searched = f"RTC-D, with {', '.join(free)}" if free else "RTC, the weights alone"
     others = {
         "policy": bool(_options(run.best)),
         "uncertainty": not config.uncertainty.empty,
+        "refined": bool(run.best.record.get("refinement")),
         "nested": config.search.mode == "nested",
     }
-    told = [name for name, present in others.items() if present]
+    told = [", ".join(["RTC-D", *free]) if free else "RTC"]
+    told += [name for name, present in others.items() if present]
     told += [] if config.search.objective == "sum" else [f"objective {words(config.search.objective)}"]
-    return f"{words(config.plant.name)} {'; '.join([searched, *told])}"
+    return f"`{run.name}`: {'; '.join(told)}"
 
 
 def _options(elite: Elite) -> dict[str, float]:
@@ -50,7 +51,8 @@ def gains(runs: Sequence[Run]) -> Rows:
     yield "volume sum over the initial candidate's", "the paper", "rtcd_jax, sampled", "proved"
     for run in runs:
         free = any(variable.free for variable in run.config.design.values())
-        paper = PAPER.get((run.config.plant.name, free)) if run.config.search.objective == "sum" else None
+        as_there = run.config.search.objective == "sum" and not _options(run.best)
+        paper = PAPER.get((run.config.plant.name, free)) if as_there else None
         certificate = run.certificates.get("000")
         whole = certificate and certificate.guarantee == "proved" and not certificate.start
         proved = certificate.shown["sum"] if certificate and whole else None
@@ -65,11 +67,11 @@ def candidates(runs: Sequence[Run]) -> Rows:
     )  # fmt: skip
     told = set[tuple[str, ...]]()
     for run in runs:
-        initial = run.initial and _candidate(f"{words(run.config.plant.name)}, initial", run, run.initial)
-        rows = [initial] if initial and initial not in told else []
-        told.update(rows)
+        initial = run.initial and _candidate("initial", run, run.initial)
+        rows = [initial] if initial and initial[:4] not in told else []
+        told.update(each[:4] for each in rows)
         yield from rows
-        yield _candidate(f"**{label(run)}**", run, run.best)
+        yield _candidate(label(run), run, run.best)
 
 
 def _candidate(name: str, run: Run, elite: Elite) -> tuple[str, ...]:
@@ -89,13 +91,12 @@ def _candidate(name: str, run: Run, elite: Elite) -> tuple[str, ...]:
 
 def proofs(runs: Sequence[Run]) -> Rows:
     """The best elites' sampled volumes, and the proved ones below them."""
-    yield "best elite", "guarantee", "inlet", "sum", "integral", "goal region", "intervals", "proving"
+    yield "best elite", "guarantee", "inlet", "sum", "integral", "goal region", "intervals"
     for run in runs:
         certificate = run.certificates.get("000")
         if certificate and certificate.shown:
-            yield label(run), "sampled", *_shown(certificate.sampled), NONE, NONE
-            effort = f"{certificate.intervals}", f"{certificate.seconds:.0f} s"
-            yield NONE, f"**{certificate.guarantee}**", *_shown(certificate.shown), *effort
+            yield label(run), "sampled", *_shown(certificate.sampled), NONE
+            yield NONE, f"**{certificate.guarantee}**", *_shown(certificate.shown), f"{certificate.intervals}"
 
 
 def _shown(volumes: Mapping[str, float]) -> list[str]:

@@ -8,9 +8,13 @@ import sys
 import numpy as np
 import pytest
 
-from rtcd_jax.analysis.report.words import words
 from tests.analysis.report.runs import finished, verify_and_disturb
 from tests.paths import ROOT
+
+
+def rows_of(text, name):
+    """Of the table of candidates."""
+    return [line for line in text.splitlines() if line.startswith(f"| `{name}`") and line.count("|") == 11]
 
 
 def printed(*arguments):
@@ -33,7 +37,7 @@ def test_the_numbers_are_the_stored_ones(tables):
     runs, text = tables
     for run in runs:
         stored = json.loads((run / "elites" / "000.json").read_text())["volumes"]["sum"]
-        (row,) = [line for line in text.splitlines() if line.startswith(f"| **{words(run.name)} ")]
+        (row,) = rows_of(text, run.name)
         assert float(re.findall(r"[\d.]+(?:e[+-]\d+)?", row.split("|")[4])[0]) == pytest.approx(stored, rel=5e-3)
 
 
@@ -43,7 +47,7 @@ def test_a_document_with_all_rows_passes_and_one_with_another_digit_does_not(tab
     document = tmp_path / "page.md"
     document.write_text(f"# Results\n\n{text}")
     assert printed(*runs, "--check", document).returncode == 0
-    rows = [line for line in text.splitlines() if line.startswith("| **pendulum")]
+    rows = rows_of(text, "pendulum")
     wrong = np.random.default_rng(0).choice([k for k, mark in enumerate(rows[0]) if mark.isdigit()])
     digit = (int(rows[0][wrong]) + 1) % 10
     document.write_text(text.replace(rows[0], f"{rows[0][:wrong]}{digit}{rows[0][wrong + 1 :]}"))
