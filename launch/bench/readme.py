@@ -1,7 +1,7 @@
 """Prints the tables of results in README.md and docs/results.md from stored runs, so that no two of them disagree.
 
     python launch/bench/readme.py checkpoints/pendulum_rtc checkpoints/pendulum_rtcd checkpoints/cartpole_rtc
-    python launch/bench/readme.py … --check README.md docs/results.md    # exit code 1: rows that stand in neither
+    python launch/bench/readme.py … --check README.md docs/results.md    # exit code 1: rows that are none of theirs
 
 Every run is read as `rtcd report` reads it, its certificates checked. Ratios are to the initial candidate's sum as the
 run sampled it; a proved one only from t = 0 on. ± is the spread of the sum over further random numbers, 0.1 % where it
@@ -96,7 +96,7 @@ def proofs(runs: Sequence[Run]) -> Rows:
         certificate = run.certificates.get("000")
         if certificate and certificate.shown:
             yield label(run), "sampled", *_shown(certificate.sampled), NONE
-            yield NONE, f"**{certificate.guarantee}**", *_shown(certificate.shown), f"{certificate.intervals}"
+            yield label(run), f"**{certificate.guarantee}**", *_shown(certificate.shown), f"{certificate.intervals}"
 
 
 def _shown(volumes: Mapping[str, float]) -> list[str]:
@@ -161,7 +161,7 @@ def row(cells: Sequence[str]) -> str:
 
 
 def main() -> int:
-    """Prints the tables, or the rows that the given documents lack."""
+    """Prints the tables, or the documents' rows that are none of them."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("runs", nargs="+", type=Path)
     parser.add_argument("--check", nargs="+", type=Path, default=[], metavar="FILE")
@@ -169,10 +169,11 @@ def main() -> int:
     runs = [read_run(path) for path in options.runs]
     tables = [[row(cells) for cells in table(runs)] for table in TABLES]
     if options.check:
-        text = "\n".join(path.read_text(encoding="utf-8") for path in options.check)
-        missing = [line for _, *rows in tables for line in rows if line not in text]
-        print("\n".join(missing) or "every row stands there")
-        return int(bool(missing))
+        known, named = {line for rows in tables for line in rows}, tuple(f"| `{run.name}`: " for run in runs)
+        lines = [line for path in options.check for line in path.read_text(encoding="utf-8").splitlines()]
+        wrong = [line for line in lines if line.startswith(named) and line not in known]
+        print("\n".join(wrong) or "every row of these runs is as printed")
+        return int(bool(wrong))
     for head, *rows in tables:
         if rows:
             print("\n".join([head, "|---" * (head.count("|") - 1) + "|", *rows, ""]))

@@ -47,10 +47,10 @@ def test_a_document_with_all_rows_passes_and_one_with_another_digit_does_not(tab
     document = tmp_path / "page.md"
     document.write_text(f"# Results\n\n{text}")
     assert printed(*runs, "--check", document).returncode == 0
-    rows = rows_of(text, "pendulum")
-    wrong = np.random.default_rng(0).choice([k for k, mark in enumerate(rows[0]) if mark.isdigit()])
-    digit = (int(rows[0][wrong]) + 1) % 10
-    document.write_text(text.replace(rows[0], f"{rows[0][:wrong]}{digit}{rows[0][wrong + 1 :]}"))
+    (row,) = rows_of(text, "pendulum")
+    place = np.random.default_rng(0).choice([k for k, mark in enumerate(row) if mark.isdigit()])
+    wrong = f"{row[:place]}{(int(row[place]) + 1) % 10}{row[place + 1 :]}"
+    document.write_text(text.replace(row, wrong))
     ended = printed(*runs, "--check", document)
     assert ended.returncode == 1
-    assert ended.stdout.splitlines() == [rows[0]]
+    assert ended.stdout.splitlines() == [wrong]
