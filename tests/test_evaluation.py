@@ -37,6 +37,7 @@ def _rechunked(chunk: int):
     return jax.jit(make_evaluate(dataclasses.replace(found, config=config)))
 
 
+@pytest.mark.thorough
 def test_the_parts_of_an_evaluation_belong_together():
     evaluation = pipeline.evaluated()
     np.testing.assert_array_equal(evaluation.genome, pipeline.genomes())

@@ -282,6 +282,7 @@ def test_a_motion_that_leaves_the_boxes_has_an_empty_funnel():
     assert _boxed()(policy).status == Status.FUNNEL_EMPTY
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("number", [np.nan, np.inf])
 def test_a_value_that_is_not_finite_is_said(number):
     assert _boxed()(_with(RESTING, values=RESTING.values.at[3, 0, 0].set(number))).status == Status.NOT_FINITE

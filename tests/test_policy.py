@@ -89,6 +89,7 @@ def test_values_are_symmetric_positive_definite_at_every_knot(policies):
     assert np.max(np.abs(policies.gains[STIFF])) > 100
 
 
+@pytest.mark.thorough
 def test_the_last_value_is_the_goals_algebraic_riccati_solution(problem, policies):
     for row in range(len(MASS)):
         model = Linearized(problem.plant, row)

@@ -102,6 +102,7 @@ def test_intervals_solve_the_dynamics_to_integration_accuracy(problem, solved):
     assert np.max(trajectories.defect) <= 1e-9
 
 
+@pytest.mark.thorough
 def test_intervals_solve_the_equations_of_motion_as_scipy_integrates_them(problem, solved):
     """m l^2 theta'' = u - b theta' - m g l sin theta, written out once more."""
     candidate, trajectory = (take(tree, 0) for tree in solved)

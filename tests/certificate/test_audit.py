@@ -164,6 +164,7 @@ def audited_without_faults(tmp_path, arrays, record, plant, rho):
     return Elite.read(out, "000")
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("name", ["acrobot", "furuta", "reaction_wheel"])
 def test_the_funnel_of_any_packaged_robot_is_audited(tmp_path, name):
     """Its elite is the robot's, bit by bit, and has a claim."""

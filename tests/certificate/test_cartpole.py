@@ -52,6 +52,7 @@ def test_no_motion_leaves_what_is_proved(proved):
     assert levels[0] > 0.9
 
 
+@pytest.mark.thorough
 def test_the_ellipsoids_are_large_enough_to_matter(proved):
     """The goal region touches the rail, and is far from where the linear model would do."""
     axes = floats(proved["goal"]["axes"])

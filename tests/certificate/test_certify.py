@@ -185,6 +185,7 @@ def test_an_elite_is_proved_by_one_process_at_a_time(tmp_path):
     assert not list((run / "certificates").glob(".*"))
 
 
+@pytest.mark.thorough
 def test_summaries_of_several_processes_keep_each_other_s_elites(tmp_path):
     run = folder_of(tmp_path)
     arrays, record = swing.elite()
@@ -244,6 +245,7 @@ def test_a_killed_search_goes_on_to_the_same_certificate(tmp_path, optimized):
     assert (killed / "certificates" / "000.json").read_bytes() == (whole / "certificates" / "000.json").read_bytes()
 
 
+@pytest.mark.thorough
 def test_another_elite_s_journal_is_not_used(tmp_path):
     run = folder_of(tmp_path)
     journal = run / "certificates" / ".000.partial.jsonl"

@@ -259,6 +259,7 @@ def test_a_thousand_hostile_files_get_the_same_exit_code(second, tmp_path, text,
     assert codes[2] == 0
 
 
+@pytest.mark.thorough
 def test_texts_of_all_alphabets_have_the_same_digest(second, tmp_path, content):
     """Canonical JSON: escapes, pairs of surrogates and halves of them, keys in the order of their code points."""
     content["notes"] = {"é": '\x7f\t\\"/\b\f', "\U0001f600": "\ud800", "\uff41": "\udc00x", "": "\x00" * 3}

@@ -24,6 +24,8 @@ from tests.certificate.loops import Simulated, ball, floats
 from tests.certificate.test_check import nudged, refusal, resealed
 from tests.certificate.test_theorems import anywhere, shown
 
+pytestmark = pytest.mark.thorough  # proofs
+
 VERSION_1 = Path(__file__).parent / "files" / "version1.json.gz"
 """Of the elite of `swing.py`, by a checker that knew no other version."""
 MARGIN_THEN, INLET_THEN = 0.8240586116152051, 9.592102479145328
@@ -226,7 +228,6 @@ def test_the_mass_matrix_must_be_definite_for_all_robots_and_angles():
 # A whole certificate --------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.thorough
 def test_it_says_what_it_bears(borne):
     report = check.check(borne)
     words = check.sentence(report)
@@ -243,7 +244,6 @@ def test_it_says_what_it_bears(borne):
     assert {case.split("/")[0][-1] for case in borne["funnel"][0]["cases"]} == {"-", "+"}
 
 
-@pytest.mark.thorough
 def test_no_motion_of_any_robot_leaves_and_worse_ones_do(borne):
     def followed(beyond):
         return summed([Part.of(Motions(borne, beyond).follow(400, 16, np.random.default_rng(3)))], 16)
@@ -254,7 +254,6 @@ def test_no_motion_of_any_robot_leaves_and_worse_ones_do(borne):
     assert followed(4.0).left_funnel > 0
 
 
-@pytest.mark.thorough
 def test_the_elite_is_one_of_its_robots(bearing, borne):
     assert standing(bearing, "000").proved
     arrays, record = swing.elite()
@@ -319,7 +318,6 @@ def test_what_it_does_not_bear_is_refused_with_its_place(borne, lie):
     assert reason in refusal(resealed(borne))
 
 
-@pytest.mark.thorough
 def test_a_missing_case_is_refused(borne):
     cases = borne["funnel"][1]["cases"]
     del cases[next(name for name in cases if name.startswith("free-"))]
@@ -360,7 +358,6 @@ def delayed(delayed_text):
     return json.loads(delayed_text)
 
 
-@pytest.mark.thorough
 def test_five_milliseconds_cost_little(delayed, content):
     """To first order a delay is a known change of the feedback; as an error of its own size it leaves no funnel."""
     report, without = check.check(delayed), check.check(content)
@@ -379,7 +376,6 @@ def first_order(claim, interval):
     return check.lateness(claim, late, bounds.misfit, jumps), late
 
 
-@pytest.mark.thorough
 def test_a_former_feedback_is_what_the_first_order_says(delayed):
     """On simulated motions under delays that jump: phi(r) = phi(t) - (t - r) rho e up to `lateness`, where u_lin is not
     beyond the limits by more than the zeroth order's error."""
@@ -452,7 +448,6 @@ def test_laws_of_old_measurements_may_not_be_left_out(delayed):
     assert "funnel[1].cases: must have the cases" in refusal(resealed(delayed))
 
 
-@pytest.mark.thorough
 def test_no_delayed_motion_leaves_and_later_ones_do(delayed):
     def followed(beyond):
         return summed([Part.of(Motions(delayed, beyond).follow(200, 16, np.random.default_rng(3)))], 16)
@@ -534,7 +529,6 @@ def judged(text, rounds, seed):
     return counts
 
 
-@pytest.mark.thorough
 def test_mutated_statements_are_refused_or_true(borne_text):
     counts = judged(borne_text, 12, 1)
     assert counts["refused"] > 3

@@ -115,6 +115,7 @@ def test_the_ratio_is_one_on_the_boundary_and_v_over_rho_at_the_knots(export, lo
         np.testing.assert_allclose(monitor(elite.time[k], x).ratio, expected, rtol=1e-8)
 
 
+@pytest.mark.thorough
 def test_the_monitor_says_inside_and_abort_on_both_sides_of_the_boundary(export, loop):
     bundle, monitor = export.bundle, loop[1]
     t = 0.6 * bundle.elite.time[-1]

@@ -48,6 +48,7 @@ def test_the_trajectory_has_the_columns_of_the_toolkits(export):
     np.testing.assert_array_equal(rows[:, 11:], 0)
 
 
+@pytest.mark.thorough
 def test_the_tables_read_back_to_the_elites_own_numbers(export):
     arrays, _ = read_elite(export.run / "elites", "000")
     header, rows = table(export.folder / "gains.csv")

@@ -45,6 +45,7 @@ def test_whole_turns_are_taken_out_of_wrapped_angles_alone(export):
     )
 
 
+@pytest.mark.thorough
 @needs_compiler
 @pytest.mark.parametrize("options", ["-O2", "-O3 -ffast-math"])
 def test_c_takes_whole_turns_out_as_python_does(export, tmp_path, options):

@@ -16,6 +16,8 @@ from rtcd_jax.plants.model import CpuDynamics
 from tests.export.conftest import module
 from tests.export.test_controller import COMPILER, OPTIMIZED, STRICT, bind, needs_compiler
 
+pytestmark = pytest.mark.thorough  # exports of proved funnels
+
 
 @pytest.fixture(scope="module")
 def claimed(proved):
@@ -105,7 +107,6 @@ def random_proof(bundle, first):
     return ProvedFunnel(begins, axes, bundle.rates)
 
 
-@pytest.mark.thorough
 @needs_compiler
 @pytest.mark.parametrize("first", [0, 1])
 def test_both_languages_evaluate_any_ellipsoids_and_the_sampled_ones_before_they_begin(export, tmp_path, first):
@@ -161,7 +162,6 @@ def test_the_next_slower_tried_rate_loses_some(export):
     assert found.failed[found.divisor] == 0
 
 
-@pytest.mark.thorough
 def test_where_no_tried_rate_suffices_that_is_said(export, monkeypatch):
     elite = export.bundle.elite
     gains = replace(elite, K=30 * elite.K, K_goal=30 * elite.K_goal)  # a loop that no slow call can hold

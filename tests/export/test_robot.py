@@ -46,6 +46,7 @@ def test_mass_matrix_gravity_and_damping_are_the_designs(export, described):
             np.testing.assert_allclose(theirs, ours, rtol=1e-12, atol=1e-12)
 
 
+@pytest.mark.thorough
 def test_joints_keep_their_names_and_order(export, described):
     names = [described.joint(i).name for i in range(described.njnt)]
     assert names == [export.bundle.model.joint(i).name for i in range(described.njnt)]

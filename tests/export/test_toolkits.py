@@ -111,6 +111,7 @@ def test_the_controller_swings_up_in_a_toolkits_own_loop(export, number):
     assert away < 1e-2 < before
 
 
+@pytest.mark.thorough
 def test_a_call_of_no_toolkit_is_refused_with_those_that_there_are(export):
     controller, n = export.module.Controller(), export.bundle.elite.x_goal.size
     for measured, named in (

@@ -3,6 +3,7 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 from rtcd_jax.numerics.derivatives import basis, jacobian, value_and_jacobian
 
@@ -31,6 +32,7 @@ def test_the_value_comes_with_its_jacobian():
     np.testing.assert_array_equal(slope, jax.jit(lambda z: jacobian(f, z))(z))
 
 
+@pytest.mark.thorough
 def test_jacobian_agrees_with_central_differences():
     """Truncation and cancellation of a central difference with step 1e-5 are both about 1e-10."""
     z = points(6)
@@ -39,6 +41,7 @@ def test_jacobian_agrees_with_central_differences():
     np.testing.assert_allclose(jacobian(f, z), numerical, atol=1e-8)
 
 
+@pytest.mark.thorough
 def test_a_point_without_a_batch():
     np.testing.assert_allclose(jacobian(f, points()), jax.jacrev(f)(points()), rtol=1e-13)
 

@@ -103,6 +103,7 @@ def test_a_part_is_the_row_cut():
     np.testing.assert_array_equal(points, whole[:, 1:3])
 
 
+@pytest.mark.thorough
 def test_the_largest_set_inside_the_box_touches_it_and_no_more():
     row, limits = random_row(3), jnp.array([2.5, 3.0, 3.5])
     radii = row.radii_inside(limits)
@@ -111,6 +112,7 @@ def test_the_largest_set_inside_the_box_touches_it_and_no_more():
     np.testing.assert_allclose(np.max(reach / limits[:, None], 0), 1, rtol=1e-12)
 
 
+@pytest.mark.thorough
 def test_no_set_is_inside_a_box_without_its_center():
     row = random_row(2)
     outside = jnp.max(jnp.abs(row.centers), 1) * 0.99

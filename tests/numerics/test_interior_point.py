@@ -88,6 +88,7 @@ def test_the_minimum_time_is_that_of_full_force_to_the_middle_and_back(solution)
     np.testing.assert_allclose(solution.us[:, 0, FAST, 0], expected, atol=0.01)
 
 
+@pytest.mark.thorough
 def test_the_least_effort_is_the_shortest_solution_of_the_end_conditions(solution):
     """Without a price on time the step is the longest, and u the pseudo-inverse of the linear map to the end state."""
     h = STEPS[1]
@@ -208,6 +209,7 @@ def test_a_problem_does_not_notice_its_neighbours(solution):
     assert not np.any(beside.solved[FRUGAL])
 
 
+@pytest.mark.thorough
 def test_single_precision_stays_single():
     parameters = {key: jax.ShapeDtypeStruct((6,), jnp.float32) for key in PARAMETERS}
     single = Guess(*(jnp.asarray(leaf, jnp.float32) for leaf in guess(0.3)))

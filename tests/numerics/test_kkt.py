@@ -94,6 +94,7 @@ def test_the_step_leaves_no_residual_in_the_dense_system(seed):
         np.testing.assert_allclose(hessian @ z + gradient + constraints.T @ multipliers, 0, atol=1e-9 * size)
 
 
+@pytest.mark.thorough
 def test_the_step_is_the_dense_solution():
     problem = random_subproblem()
     step = solve(problem)

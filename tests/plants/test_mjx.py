@@ -104,6 +104,7 @@ def test_mjx_step_of_batched_designs_is_c_mujocos_on_recompiled_models(robot, mj
         np.testing.assert_allclose(found[index], expected, rtol=1e-12, atol=1e-12)
 
 
+@pytest.mark.thorough
 def test_mjx_step_takes_a_traced_time_step(robot, mjx_step):
     for dt in (0.001, 0.02):
         expected = _c_step(robot.recompiled(0), robot.x[0], robot.u[0], dt)

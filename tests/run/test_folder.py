@@ -192,6 +192,7 @@ def test_a_saved_state_is_restored_bit_by_bit_with_its_types(tmp_path):
         assert np.asarray(old).tobytes() == np.asarray(new).tobytes()
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("lacking", [{"goal"}, {"push", "goal"}])
 def test_a_state_of_an_older_version_goes_on(tmp_path, lacking):
     """It knew fewer volumes, and one status less."""
@@ -290,6 +291,7 @@ def refused(path, config=None):
     return str(error.value)
 
 
+@pytest.mark.thorough
 def test_another_configuration_is_refused_with_every_differing_key_and_both_values(tmp_path):
     drive(tmp_path / "run", experiment(generations=1))
     before = results(tmp_path / "run")

@@ -20,6 +20,8 @@ from rtcd_jax.volume import VOLUMES
 from tests import pipeline
 from tests.pipeline import same
 
+pytestmark = pytest.mark.thorough  # a real evaluation
+
 KNOTS = 51
 
 
@@ -37,7 +39,6 @@ def record():
     return record_of(pipeline.problem(), _row(pipeline.RTCD))
 
 
-@pytest.mark.thorough
 def test_what_is_stored_is_read_back(arrays, record):
     """Also as the types say it: what goes on with a stored elite is compiled for arrays of JAX's shapes and kinds."""
     evaluation, rates = _row(pipeline.RTCD), np.ones((KNOTS - 1, 2, 2, 2))
@@ -50,7 +51,6 @@ def test_what_is_stored_is_read_back(arrays, record):
     np.testing.assert_allclose(list(again.volumes.named.values()), list(evaluation.volumes.named.values()), rtol=1e-12)
 
 
-@pytest.mark.thorough
 def test_the_policy_of_the_record_is_the_candidate_s():
     """Where the search chose it; else the configuration's, as everywhere in this box."""
     evaluation, fixed = _row(pipeline.RTCD), {"input_weight": 1.0, "authority": 1.0, "discount": 0.0}

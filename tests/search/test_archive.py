@@ -88,6 +88,7 @@ def test_without_neighbors_the_order_of_merges_does_not_matter():
         assert same(archive.costs, at_once.costs)
 
 
+@pytest.mark.thorough
 def test_merging_twice_changes_nothing():
     evaluation = random_population(1)
     once = elites.merge(nothing(), evaluation, BY_SUM, 4, DISTANCE)
@@ -118,6 +119,7 @@ def test_distance_zero_keeps_all_but_is_no_license_for_duplicates_of_one_row():
     assert archive.count == 2
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("status", [s for s in Status if s != Status.OK])
 def test_a_failed_candidate_never_enters_however_large_its_volume(status):
     archive = merged([population([[0.1, 0.1], [0.9, 0.9]], [1e9, 1.0], [status, Status.OK])])
@@ -139,6 +141,7 @@ def test_empty_slots_are_recognizable_and_survive_a_merge_of_failures():
     assert np.all(archive.generations == -1)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("objective", "value"), [("sum", 3.0), ("integral", 6.0), ("inlet", 1 / 3), ("geometric_mean", 9.0), ("push", 0.03)]
 )

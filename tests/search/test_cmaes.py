@@ -262,6 +262,7 @@ def test_a_stop_holds_on_one_side_of_its_threshold(reason, below, above):
     assert cmaes.stop(S, with_evolution(state, **above)) == reason
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("reason", "costs"),
     [(Stop.FLAT, jnp.zeros(8)), (Stop.FLAT, jnp.linspace(0, 1e-13, 8)), (Stop.NOTHING_FEASIBLE, jnp.full(8, jnp.inf))],

@@ -81,6 +81,7 @@ def test_the_initial_genome_is_the_first_that_is_evaluated(mode):
     np.testing.assert_array_equal(first.genomes[0], INITIAL)
 
 
+@pytest.mark.thorough
 @both_modes
 def test_both_modes_spend_the_same_evaluations_on_whole_populations(mode):
     sizes = []
@@ -254,6 +255,7 @@ def test_what_counts_as_no_gain(best, over):
     assert bool(search.settled(plan(patience=4).settings, best)) == over
 
 
+@pytest.mark.thorough
 def test_restarts_are_counted_and_their_reason_is_told():
     def flat(genomes, key):
         return population(genomes, jnp.ones(len(genomes)))

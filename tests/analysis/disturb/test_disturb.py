@@ -125,6 +125,7 @@ def test_verdicts_are_the_verifications(tmp_path):
     np.testing.assert_array_equal(lost, seen.left_limits | seen.missed_goal)
 
 
+@pytest.mark.thorough
 def test_a_batch_that_may_end_early_gives_the_verdicts_of_one_that_may_not(pendulums):
     elite = pendulums.elites[0]
     x = elite.points(np.zeros(40, int), np.random.default_rng(2))

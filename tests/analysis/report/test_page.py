@@ -354,6 +354,7 @@ def test_plotly_knows_every_property_of_every_plot(pages):
             assert len(Figure(each["data"], each["layout"]).data) == len(each["data"])
 
 
+@pytest.mark.thorough
 def test_one_run_gets_its_page_and_figures_several_get_one_beside_them(tmp_path, figures):
     first, second = (finished(tmp_path / name, scale=scale) for name, scale in (("rtc", 2.0), ("rtcd", 5.0)))
     page, *drawn = report([first])

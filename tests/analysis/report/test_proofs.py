@@ -74,6 +74,7 @@ BREAKS = {
 }
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("verdict", BREAKS)
 def test_what_the_checker_does_not_accept_for_this_elite_is_not_proved(run, verdict):
     BREAKS[verdict](run)

@@ -100,6 +100,7 @@ def test_a_line_that_a_kill_has_torn_costs_its_point_alone(tmp_path, monkeypatch
     assert asked == [(32, 1), (64, 1), (64, 1)]
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("failure", "why"),
     [
