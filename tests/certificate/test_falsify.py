@@ -139,7 +139,7 @@ def test_a_killed_falsification_goes_on(run, tmp_path, monkeypatch):
     ("arguments", "reason"),
     [
         (["none.json"], "none.json: No such file or directory"),
-        (["."], "certificates/000.json: No such file or directory"),
+        (["."], ".: is no run folder: it has no format.json"),
         (["none.json", "--rollouts", "0"], "--rollouts = 0: must be >= 1"),
         (["none.json", "--seed", "-1"], "--seed = -1: must be >= 0"),
     ],

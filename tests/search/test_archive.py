@@ -180,7 +180,7 @@ def test_records_are_asked_for_only_where_one_enters():
     class Asked:
         def __init__(self, evaluation):
             self.genome, self.volumes, self.status = evaluation.genome, evaluation.volumes, evaluation.status
-            self.borne = evaluation.borne
+            self.borne, self.tasks = evaluation.borne, evaluation.tasks
 
         def take(self, rows):
             raise LookupError(rows)

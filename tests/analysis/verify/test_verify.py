@@ -18,7 +18,7 @@ from rtcd_jax.analysis.verify.verification import Trial, Verification
 from rtcd_jax.config.plants import stored_plant
 from rtcd_jax.elite.closed_loop import ClosedLoop, simulate
 from rtcd_jax.elite.elite import Elite
-from rtcd_jax.elite.records import write_elite
+from rtcd_jax.elite.records import FORMAT, VERSION, write_elite
 from rtcd_jax.elite.simulators import simulators_of
 from rtcd_jax.plants import model_of
 from rtcd_jax.system.errors import UserError
@@ -353,7 +353,7 @@ def test_the_same_seed_gives_the_same_states():
 def test_verify_run_refuses_what_is_no_finished_run(tmp_path):
     with pytest.raises(UserError, match=r"nowhere is no run folder: it has no format\.json"):
         verify_run(tmp_path / "nowhere", 60, 0, 1, Screen().console)
-    (tmp_path / "format.json").touch()
+    (tmp_path / "format.json").write_text(json.dumps({"format": FORMAT, "version": VERSION}))
     with pytest.raises(UserError, match="has no elites yet: finish the run first"):
         verify_run(tmp_path, 60, 0, 1, Screen().console)
     _store(tmp_path / "elites", "000", _held(HELD))
