@@ -1,5 +1,6 @@
 """CPU counts, the cache of programs and the GPUs that a job was given."""
 
+import json
 import math
 import os
 import subprocess
@@ -9,6 +10,7 @@ import jax
 import pytest
 
 from rtcd_jax.config.load import EXAMPLE, parse_yaml
+from rtcd_jax.elite.records import FORMAT, VERSION
 from rtcd_jax.problem import make_problem
 from rtcd_jax.system.devices import cores, default_cache, gpus_given, quota
 from rtcd_jax.system.errors import UserError
@@ -83,6 +85,9 @@ def test_a_cpu_is_no_substitute_for_the_gpus_of_a_job(tmp_path, environment, cod
     assert (done.returncode, done.stderr.count("\n")) == (code, 1), done.stderr
     assert done.stderr.startswith(text)
     assert not (tmp_path / "run").exists()
+    (tmp_path / "format.json").write_text(json.dumps({"format": FORMAT, "version": VERSION}))
+    (tmp_path / "elites").mkdir()
+    (tmp_path / "elites" / "000.json").touch()
     done = python(main, "disturb", tmp_path, **environment)
     assert (done.returncode, done.stderr.count("\n")) == (code, 1), done.stderr
     assert done.stderr.startswith(text)
