@@ -177,6 +177,7 @@ class RunFolder:
                 while place.exists():
                     place = folder / f"{checkpoint.step}.{next(number)}"
                 (self._state_path / f"{checkpoint.step}").rename(place)
+        self._write_digests(self._noted_digests())  # a later state of the same name is another one
 
     def append(self, record: Record) -> None:
         """Adds a generation to generations.jsonl."""
@@ -207,9 +208,12 @@ class RunFolder:
         self._saved = time.monotonic()
 
     def _note_digests(self, name: str) -> None:
-        """Adds those of the state of this name, and forgets those of states that are gone."""
+        """Adds those of the state of this name."""
         kept = {path: digest for path, digest in self._noted_digests().items() if path.parts[1] != name}
-        noted = {**kept, **self._digests(name)}
+        self._write_digests({**kept, **self._digests(name)})
+
+    def _write_digests(self, noted: dict[Path, str]) -> None:
+        """Those of the states that are there."""
         lines = [f"{digest}  {path}\n" for path, digest in noted.items() if (self._state_path / path.parts[1]).exists()]
         replace(self._digests_path, "".join(lines).encode())
 

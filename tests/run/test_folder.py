@@ -418,6 +418,7 @@ def test_a_damaged_newest_state_is_set_aside_and_the_one_before_goes_on(tmp_path
     assert "state/6 is no state of this search" in note
     assert note.endswith("going on with the state of generation 3")
     assert [path.name for path in (tmp_path / "run" / "state.damaged").iterdir()] == ["6"]
+    assert "state/6/" not in (tmp_path / "run" / "state.sha256").read_text()
     assert len((tmp_path / "run" / "generations.jsonl").read_bytes().splitlines()) == 3
     drive(tmp_path / "run", config)
     drive(tmp_path / "whole", config)
