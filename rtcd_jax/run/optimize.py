@@ -75,8 +75,9 @@ def optimize(config: Config, folder: Path, console: Console, cluster: Cluster, l
             try:
                 steps = search.run(plan, evaluate, begun, best)
                 for state, generation in iter(partial(cluster.interruptible, partial(next, steps, None)), None):
-                    run.append(generation.record())
-                    show(generation.record())
+                    line = generation.record()
+                    run.append(line)
+                    show(line)
                     run.save_if_due(state, int(state.generation))
                     console.progress(pace.progress(generation))
                     cluster.raise_if_preempted(int(state.generation))
