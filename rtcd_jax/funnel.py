@@ -65,6 +65,8 @@ def estimate_funnel(
     sets = rollouts.sets
     boxes = sets.radii_inside(jnp.asarray(problem.state_limits, sets.centers.dtype))
     saturated = saturating_radius(problem.input_limits(candidate.design), policy, sets.part(slice(-1, None)))
+    for each in problem.keep_out:
+        boxes = jnp.minimum(boxes, each.radii_clear(sets))
     boxes = jnp.minimum(boxes, REACH * saturated)
     last = goal_level(rollouts, boxes[-1], saturated, keys[0], budget)
 

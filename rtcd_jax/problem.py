@@ -11,6 +11,7 @@ from jaxtyping import Array, Float
 
 from rtcd_jax.config.load import Config
 from rtcd_jax.config.robot import value_of
+from rtcd_jax.numerics.keep_out import Set, sets_of
 from rtcd_jax.plants import make_plant
 from rtcd_jax.plants.base import Plant
 from rtcd_jax.system.devices import require_float64
@@ -58,6 +59,8 @@ class Problem:
     goal: Float[Array | np.ndarray, "n *batch"]
     state_limits: Float[np.ndarray, " n"]
     variables: tuple[Variable, ...]
+    keep_out: tuple[Set, ...] = ()
+    """Sets of states that no motion enters."""
     uncertainty: Uncertainty | None = None
     """What the funnels must bear; None for one exact model."""
     tasks: tuple["Problem", ...] = ()
@@ -124,7 +127,7 @@ def make_problem(config: Config) -> Problem:
         (alone,) = config.each.values()
         return _make_problem(alone, ("task",))
     tasks = tuple(_make_problem(alone, ("tasks", name)) for name, alone in config.each.items())
-    return replace(tasks[0], config=config, tasks=tasks)
+    return replace(tasks[0], config=config, keep_out=_keep_out(config), tasks=tasks)
 
 
 def _make_problem(config: Config, path: tuple[str, ...]) -> Problem:
@@ -136,6 +139,7 @@ def _make_problem(config: Config, path: tuple[str, ...]) -> Problem:
         goal=np.array(config.task.goal, float),
         state_limits=np.array(config.task.state_limits, float),
         variables=tuple(_variables(config)),
+        keep_out=_keep_out(config),
         uncertainty=_uncertainty(config),
     )
     _require_equilibrium(problem, path)
@@ -182,6 +186,11 @@ def _variables(config: Config):
             free=variable.free,
             logarithmic=config.logarithmic(key),
         )
+
+
+def _keep_out(config: Config) -> tuple[Set, ...]:
+    ends = [end for alone in config.each.values() for end in (alone.start, alone.task.goal)]
+    return sets_of(config.task.model_dump().get("keep_out", ()), np.array(ends))
 
 
 def _uncertainty(config: Config) -> Uncertainty | None:

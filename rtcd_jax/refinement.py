@@ -29,7 +29,7 @@ from jaxtyping import Array, Bool, Float, PRNGKeyArray
 from rtcd_jax.adversary import Situation, Worst
 from rtcd_jax.numerics import sampling
 from rtcd_jax.numerics.batched import cholesky, mv, solve_lower_transposed
-from rtcd_jax.numerics.ellipsoid import half_widths, log_volume
+from rtcd_jax.numerics.ellipsoid import Ellipsoids, half_widths, log_volume
 from rtcd_jax.numerics.hermite import cubic_hermite, cubic_hermite_rate
 from rtcd_jax.policy import Nominal, input_jumps, nominal, value_rates
 from rtcd_jax.problem import Problem
@@ -390,6 +390,9 @@ class Refinement:
         room = jnp.where(angles, jnp.minimum(limits - jnp.abs(centers), widest), limits - jnp.abs(centers))
         room = jnp.maximum(FRACTION_OF_LIMIT * room, 1e-6)
         box = jnp.min(2 * jnp.log(room / half_widths(factors)), 0)
+        for each in self.problem.keep_out:
+            clear = FRACTION_OF_LIMIT * each.radii_clear(Ellipsoids(centers, values, factors))
+            box = jnp.minimum(box, 2 * jnp.log(jnp.maximum(clear, 1e-6)))
         return Instants(values, rates, centers, center_rates, gains, inputs, factors, box)
 
     def _growth(

@@ -118,11 +118,12 @@ def roll_intervals(
     x: Float[Array, "n intervals *batch"],
     dynamics: Dynamics,
 ) -> tuple[Float[Array, "n intervals *batch"], Float[Array, "intervals *batch"]]:
-    """End states after one interval each, and the largest |x_i| / limit_i at any step.
+    """End states after one interval each, and the peaks: the largest |x_i| / limit_i at any step, above 1 as well in a
+    set to keep out of.
 
     `x` are states at the intervals' starts.
     """
-    limits, bounds = problem.state_limits, _column(problem.input_limits(candidate.design), x)
+    bounds = _column(problem.input_limits(candidate.design), x)
     align = partial(_align, behind=x.ndim - 2)
     feedforward = align(tracking.inputs)
 
@@ -138,11 +139,11 @@ def roll_intervals(
             return _rate(dynamics, candidate, Situation(x, error, asked, gain, cost, rate, bounds))
 
         x = _step(slope, x, tracking.step, dynamics.large)
-        return (x, jnp.maximum(peak, _fill(x, limits))), None
+        return (x, jnp.maximum(peak, _fill(x, problem))), None
 
     tables = tracking.states, tracking.gains, None if dynamics.opponent is None else tracking.others
     start = split(x)
-    (ends, peak), _ = short_scan(step, (start, _fill(start, limits)), tables)
+    (ends, peak), _ = short_scan(step, (start, _fill(start, problem)), tables)
     return jnp.stack(ends), peak
 
 
@@ -156,11 +157,11 @@ def roll_at_goal(
     step: float,
     parts: Int[Array, ""] | int = 1,
 ) -> tuple[Float[Array, "n *batch"], Float[Array, "*batch"]]:
-    """End states after `duration` [s] under the goal's LQR, and the largest |x_i| / limit_i till then.
+    """End states after `duration` [s] under the goal's LQR, and the peaks till then.
 
     `goal_lqr` are its gain and its value matrix. Each `step` [s] is taken in equal `parts`.
     """
-    limits, bounds = problem.state_limits, _column(problem.input_limits(candidate.design), x)
+    bounds = _column(problem.input_limits(candidate.design), x)
     gain, cost = (_align(part, x.ndim - 1) for part in goal_lqr)
     rest = jnp.zeros((x.shape[0], *(1,) * (x.ndim - 1)), x.dtype)
 
@@ -171,14 +172,14 @@ def roll_at_goal(
     def advance(_, carry):
         x, peak = carry
         x = _step(slope, x, dt, dynamics.large)
-        return x, jnp.maximum(peak, _fill(x, limits))
+        return x, jnp.maximum(peak, _fill(x, problem))
 
     def over_the_steps(_, carry):  # a loop of a fixed length: under vmap one of a traced length masks every turn
         return jax.lax.fori_loop(0, round(duration / step), advance, carry)
 
     dt = jnp.asarray(step / parts, x.dtype)
     start = split(x)
-    ends, peak = jax.lax.fori_loop(0, parts, over_the_steps, (start, _fill(start, limits)))
+    ends, peak = jax.lax.fori_loop(0, parts, over_the_steps, (start, _fill(start, problem)))
     return jnp.stack(ends), peak
 
 
@@ -214,12 +215,16 @@ def _feedback(gain, error) -> Array:
     return cast(Array, sum(gain[:, i] * e for i, e in enumerate(error)))
 
 
-def _fill(x, limits: np.ndarray):
-    """Largest |x_i| / limit_i; not a number where a limited component is none."""
+def _fill(x, problem: Problem):
+    """Largest |x_i| / limit_i, or what stands for it of a set to keep out of; not a number where a component that
+    counts is none.
+    """
     fill = jnp.zeros_like(x[0])
-    for component, limit in zip(x, limits, strict=True):
+    for component, limit in zip(x, problem.state_limits, strict=True):
         if np.isfinite(limit):
             fill = jnp.maximum(fill, jnp.abs(component) / limit)
+    for each in problem.keep_out:
+        fill = jnp.maximum(fill, each.fill(x))
     return fill
 
 

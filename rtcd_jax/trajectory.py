@@ -3,6 +3,7 @@
     min over h, x, u   h sum_k 1/2 [(x_k - x_g)' Q (x_k - x_g) + u_k' R u_k] + w_t h N
     s.t.  x_{k+1} = Phi(x_k, u_k, h),  x_0 = start,  x_N = goal,  h_min <= h <= h_max,  |x| <= x_max,  |u| <= u_max
 
+and, where the task states sets to keep out of, no x_k in one of them.
 Phi integrates the dynamics over one interval with the input held (paper, section II-B, whose DIRTRAN takes one explicit
 midpoint step instead). This verb plans for a whole population at once rather than for one candidate under vmap: the
 solver refills its lanes as candidates finish, so that slow ones do not hold up their neighbors.
@@ -65,6 +66,7 @@ def plan(problem: Problem, candidates: Candidate) -> Trajectory:
         state_limits=settings.limit_share * problem.state_limits,
         input_limits=settings.input_share * np.asarray(problem.input_limits(initial_design(problem))),
         step_limits=(settings.step.min, settings.step.max),
+        keep_out=tuple(each.shrunk(settings.limit_share) for each in problem.keep_out),
     )
     most = settings.max_iterations
 

@@ -17,6 +17,7 @@ from rtcd_jax.config import load as configuration
 from rtcd_jax.evaluation import elite_budget, make_evaluate, search_budget
 from rtcd_jax.funnel import MARGIN, _crossings, estimate_funnel, knot_levels
 from rtcd_jax.numerics.ellipsoid import half_widths
+from rtcd_jax.numerics.keep_out import sets_of
 from rtcd_jax.problem import Problem, make_problem
 from rtcd_jax.types import Candidate, Policy, Status, Trajectory
 from rtcd_jax.validation import Dynamics, Rollouts, SamplingBudget
@@ -166,6 +167,35 @@ def test_a_moving_funnel_is_that_of_linear_algebra(seed):
     assert 0 < np.sum(boxed) < len(boxed)
     np.testing.assert_allclose(levels[boxed], exact[boxed], rtol=1e-9)
     np.testing.assert_allclose(levels, exact, rtol=1e-3)
+
+
+@pytest.mark.thorough
+def test_half_spaces_in_the_place_of_limits_give_the_same_funnel():
+    """At rest and on the move: x_i <= limit and -x_i <= limit are two half spaces to keep out of."""
+    walls = [
+        {"normal": sign * row, "offset": limit} for row, limit in zip(np.eye(2), BOX, strict=True) for sign in (1, -1)
+    ]
+    open_one = dataclasses.replace(linear.problem_of([np.inf] * 2), keep_out=sets_of(walls, np.zeros((1, 2))))
+    boxed, walled = (_estimator(each, rounds=3, samples_per_knot=64) for each in (linear.problem_of(BOX), open_one))
+    moving = linear.policy(np.array([1.0, -2, 3, -1, 0, 1, -1, 2, -2, 1]), 0.1)
+    for policy in (RESTING, moving):
+        limited, kept_out = boxed(policy), walled(policy)
+        assert limited.status == kept_out.status == Status.OK
+        np.testing.assert_allclose(kept_out.levels, limited.levels, rtol=1e-9)
+        np.testing.assert_array_equal(kept_out.trials, limited.trials)
+
+
+@pytest.mark.thorough
+def test_ellipsoids_grow_until_they_touch_a_set_to_keep_out_of():
+    """A disk beside the resting funnel: V falls everywhere, so that each ellipsoid touches it."""
+    disk = sets_of([{"center": [1.0, 1.0], "semi_axes": [0.5, 0.5]}], np.zeros((1, 2)))
+    problem = dataclasses.replace(linear.problem_of([1e3, 1e3]), keep_out=disk)
+    funnel = _estimator(problem, rounds=3, samples_per_knot=64)(RESTING)
+    turn = np.linspace(0, 2 * np.pi, 100_000)
+    rim = 1 + 0.5 * np.stack([np.cos(turn), np.sin(turn)])
+    assert funnel.status == Status.OK
+    np.testing.assert_allclose(funnel.levels[-1], (1 - MARGIN) * _value(rim).min(), rtol=1e-6)
+    assert np.all(np.asarray(funnel.levels) <= _value(rim).min())
 
 
 def _saturated(x, limit: float, duration: float, steps: int):

@@ -72,6 +72,9 @@ def _rows(prefix: str, model: type[Settings]) -> Iterator[tuple[str, str, str, s
         if isinstance(kind, type) and issubclass(kind, Settings):
             yield from _rows(f"{prefix}{name}.", kind)
             continue
+        if listed := _listed(kind):
+            yield from _rows(f"{prefix}{name}.I.", listed)
+            continue
         meaning = without_unit(field)
         if Variable in _leaves(kind):
             listed = get_origin(kind) is tuple
@@ -79,9 +82,19 @@ def _rows(prefix: str, model: type[Settings]) -> Iterator[tuple[str, str, str, s
         yield f"{prefix}{name}", unit(field).replace(UNIT, "its own"), _default(field), _range(field), meaning
 
 
+def _listed(kind: Any) -> type[Settings] | None:
+    """The section of which a field is a list; None of other fields, and of variables."""
+    entry = get_args(kind)[0] if get_origin(kind) is tuple else None
+    if isinstance(entry, type) and issubclass(entry, Settings) and entry is not Variable:
+        return entry
+    return None
+
+
 def _default(field: FieldInfo) -> str:
     if field.is_required():
         return "required"
+    if field.default is None:
+        return "none"
     return {True: "true", False: "false"}[field.default] if isinstance(field.default, bool) else f"{field.default}"
 
 

@@ -163,8 +163,12 @@ class Config(Settings):
 
 
 def _sizes(plant: PlantConfig, task: TaskConfig) -> Iterator[Problem]:
-    for key, value in task:
-        yield from _size(("task", key), value, plant.states)
+    for key in ("start", "goal", "state_limits"):
+        yield from _size(("task", key), getattr(task, key), plant.states)
+    for i, each in enumerate(task.keep_out):
+        for key in ("normal", "center", "semi_axes"):
+            if value := getattr(each, key):
+                yield from _size(("task", "keep_out", i, key), value, plant.states)
 
 
 def _weight_sizes(plant: PlantConfig, weights: WeightsConfig) -> Iterator[Problem]:
@@ -172,7 +176,7 @@ def _weight_sizes(plant: PlantConfig, weights: WeightsConfig) -> Iterator[Proble
     yield from _size(("weights", "r"), weights.r, plant.input_units)
 
 
-def _size(path: tuple[str, ...], values: tuple, names: Collection[str]) -> Iterator[Problem]:
+def _size(path: tuple[str | int, ...], values: tuple, names: Collection[str]) -> Iterator[Problem]:
     if len(values) != len(names):
         plural = "entry" if len(names) == 1 else "entries"
         yield Problem(path, f"must have {len(names)} {plural} ({', '.join(names)}), has {len(values)}")
@@ -188,6 +192,19 @@ def _ends(task: TaskConfig, trajectory: TrajectoryConfig) -> Iterator[Problem]:
             elif abs(value) > share * limit:
                 text = f"must lie in [-{share * limit:g}, {share * limit:g}] (trajectory.limit_share of the limit)"
                 yield Problem(("task", key, i), text, value)
+        yield from _outside(task, key, share)
+
+
+def _outside(task: TaskConfig, key: str, share: float) -> Iterator[Problem]:
+    x = getattr(task, key)
+    for i, each in enumerate(task.keep_out):
+        if {len(x)} != {len(size) for size in (each.normal, each.center, each.semi_axes) if size}:
+            continue
+        if each.depth(x, 1.0) >= 0:
+            yield Problem(("task", key), f"must lie outside of task.keep_out.{i}, and not on its boundary", x)
+        elif each.depth(x, share) >= 0:
+            text = f"must lie outside of task.keep_out.{i}, grown by 1 / trajectory.limit_share = {1 / share:g}"
+            yield Problem(("task", key), text, x)
 
 
 def _tasks(

@@ -4,7 +4,7 @@
 """
 
 import contextlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from math import inf
 from typing import TYPE_CHECKING, Annotated, Any, Literal, cast
@@ -15,6 +15,7 @@ from pydantic import (
     GetCoreSchemaHandler,
     SerializeAsAny,
     SerializerFunctionWrapHandler,
+    field_validator,
     model_serializer,
 )
 from pydantic_core.core_schema import CoreSchema, no_info_plain_validator_function
@@ -77,7 +78,64 @@ class Variable(Settings):
 Numbers = Annotated[tuple[Annotated[float, Field(ge=-1e6, le=1e6), ARITHMETIC], ...], Field(strict=False)]
 Limits = Annotated[tuple[Annotated[float, Field(ge=1e-6, allow_inf_nan=True), ARITHMETIC], ...], Field(strict=False)]
 LARGEST_LIMIT = 1e6
+LARGEST_OFFSET = 1e9
 Variables = Annotated[tuple[Variable, ...], Field(strict=False)]
+
+
+class KeepOutConfig(Settings):
+    """A set of states to keep out of: a half space by `normal` and `offset`, or an ellipsoid by the other two."""
+
+    normal: Numbers = Field(
+        default=(), description="half space: a vector; normal . x > offset is kept out [1/state's unit]"
+    )
+    offset: float | None = Field(default=None, description="half space: see normal [-]")
+    center: Numbers = Field(default=(), description=f"ellipsoid: its center [{UNIT}]")
+    semi_axes: Limits = Field(
+        default=(), description=f"ellipsoid: half its width in every state, .inf where it has no end [{UNIT}]"
+    )
+
+    @field_validator("offset", mode="plain")
+    @classmethod
+    def _finite(cls, offset: Any) -> float:
+        offset = _number(offset)
+        if isinstance(offset, bool) or not isinstance(offset, int | float) or not abs(offset) <= LARGEST_OFFSET:
+            raise refusal(f"must be >= {-LARGEST_OFFSET:g} and <= {LARGEST_OFFSET:g}")
+        return float(offset)
+
+    @model_serializer(mode="wrap")
+    def _of_its_kind(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        return {key: value for key, value in handler(self).items() if value not in ((), [], None)}
+
+    def problems(self) -> Iterator[Problem]:
+        kinds = {("normal", "offset"), ("center", "semi_axes")}
+        given = tuple(key for key, value in self if value not in ((), None))
+        if given not in kinds:
+            text = "must have the keys normal and offset of a half space, or center and semi_axes of an ellipsoid"
+            yield Problem((), f"{text}; has {', '.join(given) or 'none'}")
+            return
+        if self.normal and not any(self.normal):
+            yield Problem(("normal",), "must not be zero", self.normal)
+        for i, axis in enumerate(self.semi_axes):
+            if LARGEST_LIMIT < axis < inf:
+                yield Problem(("semi_axes", i), f"must be <= {LARGEST_LIMIT:g}, or .inf for no end", axis)
+        if self.semi_axes and inf == min(self.semi_axes):
+            yield Problem(("semi_axes",), "must have an entry that is not .inf: nothing would be left", self.semi_axes)
+
+    def in_words(self, states: Iterable[str]) -> str:
+        """The set as an inequality in the states."""
+        if self.normal:
+            terms = [f"{a:+g} {name}" for a, name in zip(self.normal, states, strict=True) if a]
+            return f"{' '.join(terms)} > {self.offset:g}"
+        parts = zip(states, self.center, self.semi_axes, strict=True)
+        terms = [f"(({name} - {center:g}) / {axis:g})^2" for name, center, axis in parts if axis < inf]
+        return f"{' + '.join(terms)} < 1"
+
+    def depth(self, x: tuple[float, ...], share: float) -> float:
+        """Positive inside, negative outside; of the ellipsoid grown by 1 / share."""
+        if self.normal:
+            return sum(a * b for a, b in zip(self.normal, x, strict=True)) - cast(float, self.offset)
+        parts = zip(x, self.center, self.semi_axes, strict=True)
+        return 1 - sum(((a - c) / axis) ** 2 for a, c, axis in parts) * share**2
 
 
 class TaskConfig(Settings):
@@ -86,6 +144,13 @@ class TaskConfig(Settings):
     state_limits: Limits = Field(
         description=f"largest |x_i|, at most 1e6, or .inf for none; leaving them is a failure [{UNIT}]"
     )
+    keep_out: Annotated[tuple[KeepOutConfig, ...], Field(strict=False)] = Field(
+        default=(), description="sets of states to keep out of, of all tasks; entering one is a failure"
+    )
+
+    @model_serializer(mode="wrap")
+    def _without_no_sets(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        return {key: value for key, value in handler(self).items() if key != "keep_out" or value}
 
     def problems(self) -> Iterator[Problem]:
         for i, limit in enumerate(self.state_limits):
@@ -142,7 +207,8 @@ class TrajectoryConfig(Settings):
         default=1.0,
         ge=0.01,
         le=1,
-        description="share of the state limits for the nominal motion; the rest is the funnel's [-]",
+        description="share of the state limits and of the room to sets to keep out of for the nominal motion; the rest "
+        "is the funnel's [-]",
     )
     input_share: float = Field(
         default=1.0,

@@ -92,6 +92,7 @@ class ClosedLoop:
 class Outcome:
     """Of every state: did it leave the funnel at a later knot, leave the limits at any step, miss the goal?
 
+    Who enters a set to keep out of leaves the limits too.
     A state that left the limits is followed no further and has missed the goal too.
     """
 
@@ -214,8 +215,11 @@ def dormand_prince(f: Dynamics, longest_step: float, relative: float, absolute: 
 
 
 def outside_limits(elite: Elite, x: Float[np.ndarray, "states n"]) -> Bool[np.ndarray, " states"]:
-    """Beyond the limits, or no longer finite."""
-    return ~np.all(np.abs(x) <= np.minimum(elite.state_limits, np.finfo(float).max), axis=1)
+    """Beyond the limits, in a set to keep out of, or no longer finite."""
+    outside = ~np.all(np.abs(x) <= np.minimum(elite.state_limits, np.finfo(float).max), axis=1)
+    for each in elite.keep_out:
+        outside |= each.entered(x.T)
+    return outside
 
 
 def _modes(f: Dynamics, x: np.ndarray, u: np.ndarray, gain: np.ndarray) -> np.ndarray:

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import Any, final
 
@@ -11,6 +12,7 @@ from jaxtyping import Float, Int
 
 from rtcd_jax.config.plants import PlantConfig, stored_plant
 from rtcd_jax.elite.records import INITIAL, elite_folder, elite_name, read_elite, require_elites, require_one_task
+from rtcd_jax.numerics.keep_out import Set, sets_of
 from rtcd_jax.system.errors import UserError, printable
 
 CLAIMED = "claimed"
@@ -153,6 +155,11 @@ class Elite:
             UserError: no such robot.
         """
         return stored_plant(self.plant, self.record.get("robot"))
+
+    @cached_property
+    def keep_out(self) -> tuple[Set, ...]:
+        """Sets of states that the motions keep out of."""
+        return sets_of(self.record.get("keep_out", ()), np.stack([self.x[0], self.x_goal]))
 
     @property
     def design_units(self) -> Mapping[str, str]:

@@ -24,6 +24,8 @@ def understood(problem: Problem) -> Iterator[str]:
     yield f"robot      {problem.config.plant.name}: {plant.convention}"
     bounds = zip(plant.state_names, plant.state_units, problem.state_limits, strict=True)
     yield "states     " + ", ".join(f"|{name}| <= {limit:.6g} {unit}" for name, unit, limit in bounds)
+    for each in problem.config.task.keep_out:
+        yield f"keep out   {each.in_words(plant.state_names)}"
     inputs = zip(plant.input_names, plant.input_units, np.asarray(problem.input_limits(design)), strict=True)
     yield "inputs     " + ", ".join(f"|{name}| <= {limit:.6g} {unit}" for name, unit, limit in inputs)
     units = plant.parameter_units

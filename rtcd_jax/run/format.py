@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from rtcd_jax.config.load import config_hash
+from rtcd_jax.config.load import Config, config_hash
 from rtcd_jax.config.plants import PLANTS
 from rtcd_jax.evaluation import elite_budget
 from rtcd_jax.genome import decode
@@ -102,6 +102,7 @@ def record_of(
             "volume": " ".join(plant.state_units),
         },
         "state_limits": [limit if np.isfinite(limit) else None for limit in problem.state_limits.tolist()],
+        **({"keep_out": keep_out} if (keep_out := _keep_out(config)) else {}),
         "status": Status(int(host.status)).name,
         "rung": "sampled",
         "epsilon": epsilon(funnel.trials, config.funnel.confidence, budget.rounds * candidates),
@@ -159,6 +160,15 @@ def common_record(problem: Problem, evaluation: TaskEvaluations) -> dict[str, An
     }
 
 
+def _keep_out(config: Config) -> list[dict[str, Any]]:
+    """The sets in the task's words, null for an infinite semi axis."""
+    stated = config.task.model_dump().get("keep_out", ())
+    for each in stated:
+        if "semi_axes" in each:
+            each["semi_axes"] = [axis if np.isfinite(axis) else None for axis in each["semi_axes"]]
+    return list(stated)
+
+
 def _searched_design(problem: Problem, evaluation: Evaluation) -> eqx.Module:
     """The design that the search chose, without what the task changes of it."""
     if not problem.config.design_edits:
@@ -176,6 +186,8 @@ def _pushes(problem: Problem, evaluation: Evaluation) -> tuple[np.ndarray, np.nd
     room = (problem.state_limits - np.abs(xs))[:, :, None]
     with np.errstate(divide="ignore", invalid="ignore"):
         within = np.where(jumps != 0, room / np.abs(jumps), np.inf).min(1)
+    for each in problem.keep_out:
+        within = np.minimum(within, each.reach(xs.T[:, :, None], np.moveaxis(jumps, 1, 0)))
     return np.where(int(evaluation.status) == Status.OK, inside, 0), within
 
 

@@ -61,6 +61,8 @@ def errors(changes):
 
 VARIABLE = {"initial": 0.5, "min": 0.5, "max": 0.5}
 
+WALL = {"normal": [0, 1], "offset": 5}
+BALL = {"center": [0, 5], "semi_axes": [1, 1]}
 REFUSED = {
     "misspelt section": ({"serch": {}}, "serch = {}: unknown key; did you mean 'search'? Valid: plant, task"),
     "misspelt key": (
@@ -119,6 +121,63 @@ REFUSED = {
         "funnel.goal.step = 1e-06: must be >= horizon / 100000 = 0.01",
     ),
     "huge limit": ({"task.state_limits.0": 1e308}, "task.state_limits.0 = 1e+308: must be <= 1e+06, or .inf for none"),
+    "a set of no kind": (
+        {"task.keep_out": [{"normal": [0, 1]}]},
+        "task.keep_out.0: must have the keys normal and offset of a half space, or center and semi_axes of an "
+        "ellipsoid; has normal",
+    ),
+    "a set of both kinds": (
+        {"task.keep_out": [{**WALL, "center": [0, 5], "semi_axes": [1, 1]}]},
+        "task.keep_out.0: must have the keys normal and offset of a half space, or center and semi_axes",
+    ),
+    "a set's unknown key": (
+        {"task.keep_out": [WALL, {"radius": 1}]},
+        "task.keep_out.1.radius = 1: unknown key; valid: normal, offset, center, semi_axes",
+    ),
+    "no normal": ({"task.keep_out": [WALL | {"normal": [0, 0]}]}, "task.keep_out.0.normal = (0.0, 0.0): must not be"),
+    "short normal": (
+        {"task.keep_out": [WALL | {"normal": [1]}]},
+        "task.keep_out.0.normal: must have 2 entries (theta, theta_dot), has 1",
+    ),
+    "infinite normal": ({"task.keep_out": [WALL | {"normal": [math.inf, 1]}]}, "task.keep_out.0.normal.0 = inf: must"),
+    "infinite offset": (
+        {"task.keep_out": [WALL | {"offset": math.inf}]},
+        "task.keep_out.0.offset = inf: must be >= -1",
+    ),
+    "offset in words": ({"task.keep_out": [WALL | {"offset": "far"}]}, "task.keep_out.0.offset = 'far': "),
+    "negative semi axis": (
+        {"task.keep_out": [BALL | {"semi_axes": [1, -1]}]},
+        "task.keep_out.0.semi_axes.1 = -1: must be >= 1e-06; ellipsoid: half its width in every state",
+    ),
+    "semi axis is not a number": (
+        {"task.keep_out": [BALL | {"semi_axes": [1, math.nan]}]},
+        "task.keep_out.0.semi_axes",
+    ),
+    "huge semi axis": ({"task.keep_out": [BALL | {"semi_axes": [1, 1e7]}]}, "task.keep_out.0.semi_axes.1 = 10000000.0"),
+    "no end in any state": (
+        {"task.keep_out": [BALL | {"semi_axes": [math.inf, math.inf]}]},
+        "task.keep_out.0.semi_axes = (inf, inf): must have an entry that is not .inf: nothing would be left",
+    ),
+    "long center": (
+        {"task.keep_out": [BALL | {"center": [0, 5, 0]}]},
+        "task.keep_out.0.center: must have 2 entries (theta, theta_dot), has 3",
+    ),
+    "start in a half space": (
+        {"task.keep_out": [{"normal": [-1, 0], "offset": -1}]},
+        "task.start = (0.0, 0.0): must lie outside of task.keep_out.0, and not on its boundary",
+    ),
+    "goal on a half space's boundary": (
+        {"task.keep_out": [{"normal": [1, 0], "offset": math.pi}]},
+        "task.goal = (3.141592653589793, 0.0): must lie outside of task.keep_out.0, and not on its boundary",
+    ),
+    "goal in an ellipsoid": (
+        {"task.keep_out": [BALL | {"center": [3, 5], "semi_axes": [1, 6]}]},
+        "task.goal = (3.141592653589793, 0.0): must lie outside of task.keep_out.0, and not on its boundary",
+    ),
+    "goal in an ellipsoid for the motion": (
+        {"task.keep_out": [BALL | {"center": [math.pi, 2], "semi_axes": [1, 1.9]}], "trajectory.limit_share": 0.9},
+        "task.goal = (3.141592653589793, 0.0): must lie outside of task.keep_out.0, grown by 1 / traj",
+    ),
     "huge start": ({"task.start.0": 1e7}, "task.start.0 = 10000000.0: must be >= -1e+06 and <= 1e+06; first state"),
     "no motion": ({"task.goal": [0, 0]}, "task.goal = (0.0, 0.0): must differ from task.start, unless"),
     "short start": ({"task.start": [0]}, "task.start: must have 2 entries (theta, theta_dot), has 1"),
@@ -321,6 +380,19 @@ def test_a_closed_form_funnel_needs_no_share():
 
 def test_infinite_limits_are_no_limits():
     assert parse(changed({"task.state_limits": [math.inf, 7]})).task.state_limits == (math.inf, 7)
+
+
+def test_sets_to_keep_out_of_are_read_written_and_counted():
+    """Arithmetic and .inf, and half spaces beside ellipsoids; without them nothing is written of them."""
+    stated = [WALL | {"offset": "2*pi"}, BALL | {"semi_axes": [math.inf, 2]}]
+    config = parse(changed({"task.keep_out": stated}))
+    half, ellipsoid = config.task.keep_out
+    assert (half.normal, half.offset) == ((0, 1), 2 * math.pi)
+    assert (ellipsoid.center, ellipsoid.semi_axes) == ((0, 5), (math.inf, 2))
+    assert parse_yaml(dump(config)) == config
+    plain = parse(changed({}))
+    assert "keep_out" not in dump(plain)
+    assert config_hash(parse(changed({"task.keep_out": []}))) == config_hash(plain) != config_hash(config)
 
 
 def pinned(*keys):

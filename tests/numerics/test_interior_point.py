@@ -11,6 +11,7 @@ from scipy.optimize import minimize
 
 from rtcd_jax.numerics.integrate import rk4
 from rtcd_jax.numerics.interior_point import ControlProblem, Guess, Settings, solve
+from rtcd_jax.numerics.keep_out import sets_of
 
 N, MOST = 10, 200
 SPEED, FORCE, STEPS = 1.2, 2.0, (0.05, 0.4)
@@ -99,7 +100,7 @@ def test_the_least_effort_is_the_shortest_solution_of_the_end_conditions(solutio
     np.testing.assert_allclose(solution.cost[FRUGAL], 0.5 * h * exact @ exact, rtol=1e-4)
 
 
-def dense_optimum(index):
+def dense_optimum(index, keep_out=()):
     """Cost of problem `index` by SLSQP on all unknowns, with the accurate stage's own derivatives."""
     parameters = {key: values[index] for key, values in PARAMETERS.items()}
 
@@ -119,6 +120,10 @@ def dense_optimum(index):
     def defects(z):
         return simulate(z)[0]
 
+    def clearances(z):
+        return jnp.concatenate([each.clearance(unpack(z)[0][1:-1].T) for each in keep_out])
+
+    outside = {"type": "ineq", "fun": jax.jit(clearances), "jac": jax.jit(jax.jacfwd(clearances))} if keep_out else ()
     first = np.concatenate([np.stack([np.linspace(0, 1, N + 1)[1:-1], np.full(N - 1, 0.4)], 1).ravel(), np.zeros(N)])
     bounds = [(None, None), (-SPEED, SPEED)] * (N - 1) + [(-FORCE, FORCE)] * N + [STEPS]
     found = minimize(
@@ -126,7 +131,10 @@ def dense_optimum(index):
         np.append(first, 0.2),
         jac=jax.jit(jax.grad(cost)),
         bounds=bounds,
-        constraints={"type": "eq", "fun": jax.jit(defects), "jac": jax.jit(jax.jacfwd(defects))},
+        constraints=[
+            {"type": "eq", "fun": jax.jit(defects), "jac": jax.jit(jax.jacfwd(defects))},
+            *([outside] if outside else []),
+        ],
         method="SLSQP",
         options={"maxiter": 500, "ftol": 1e-12},
     )
@@ -207,6 +215,40 @@ def test_a_problem_does_not_notice_its_neighbours(solution):
     for theirs, ours in zip(beside, solution, strict=True):
         np.testing.assert_array_equal(theirs[..., others, :], ours[..., others, :])
     assert not np.any(beside.solved[FRUGAL])
+
+
+WALL = {"normal": [0.0, 1.0], "offset": SPEED}
+COUPLED = {"normal": [1.0, 1.0], "offset": 1.3}
+BALL = {"center": [0.5, 1.0], "semi_axes": [0.3, 0.25]}
+
+
+def kept_out(*stated):
+    """The slow and the swaying cart that keep out of the sets, without a limit on the speed."""
+    sets = sets_of(stated, np.stack([START, GOAL]))
+    free = CART._replace(state_limits=np.full(2, np.inf), keep_out=sets)
+    two = {key: jnp.asarray(values[[SLOW_CART, SWAYING]]) for key, values in PARAMETERS.items()}
+    return sets, jax.jit(lambda: solve(free, two, guess(0.3), jnp.full(2, MOST)))()
+
+
+@pytest.mark.thorough
+def test_a_half_space_in_the_place_of_a_bound_gives_the_same_optimum(solution):
+    _, found = kept_out(WALL)
+    assert found.solved.all()
+    np.testing.assert_allclose(found.cost, solution.cost[[SLOW_CART, SWAYING], 0], rtol=1e-6)
+    np.testing.assert_allclose(found.xs, solution.xs[..., [SLOW_CART, SWAYING], 0], atol=2e-3)
+
+
+@pytest.mark.thorough
+@pytest.mark.parametrize("stated", [(COUPLED,), (BALL,), (COUPLED, BALL)])
+def test_motions_keep_out_of_sets_and_are_optimal_there(stated):
+    """Both carts would go through the sets; a dense solver finds no cheaper way around them."""
+    sets, found = kept_out(*stated)
+    assert found.solved.all()
+    clearances = np.stack([each.clearance(np.moveaxis(found.xs[1:-1], 1, 0)) for each in sets])
+    assert clearances.min() > 0
+    assert clearances.min() < 1e-3
+    dense = [dense_optimum(index, sets) for index in (SLOW_CART, SWAYING)]
+    np.testing.assert_allclose(found.cost, dense, rtol=1e-4)
 
 
 @pytest.mark.thorough

@@ -26,7 +26,7 @@ from rtcd_jax.analysis.disturb.scenarios import (
     Rollouts,
     undisturbed,
 )
-from rtcd_jax.elite.closed_loop import ARRIVED
+from rtcd_jax.elite.closed_loop import ARRIVED, outside_limits
 from rtcd_jax.elite.elite import Elite
 from rtcd_jax.elite.funnel import linearized
 from rtcd_jax.elite.simulators import dynamics_of
@@ -116,7 +116,7 @@ def _starts(elite: Elite, factor: float, states: int, random: np.random.Generato
     inside = np.empty((0, elite.x_goal.size))
     while len(inside) < states:
         drawn = elite.x[0] + factor * (elite.points(np.zeros(states, int), random) - elite.x[0])
-        inside = np.concatenate([inside, drawn[np.all(np.abs(drawn) <= elite.state_limits, axis=1)]])
+        inside = np.concatenate([inside, drawn[~outside_limits(elite, drawn)]])
     return inside[:states]
 
 

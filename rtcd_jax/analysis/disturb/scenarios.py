@@ -18,6 +18,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from rtcd_jax.elite.elite import Elite
 from rtcd_jax.numerics.integrate import rk4_step, split
+from rtcd_jax.numerics.keep_out import Set
 from rtcd_jax.plants.base import Plant
 
 STEP = 1e-3
@@ -46,6 +47,7 @@ class Loops(eqx.Module):
     input_limits: Float[Array, "C m"]
     state_limits: Float[Array, " n"]
     intervals: int = eqx.field(static=True)
+    keep_out: tuple[Set, ...] = eqx.field(static=True)
 
     @classmethod
     def of(cls, elites: Sequence[Elite], rates: Sequence[np.ndarray]) -> "Loops":
@@ -59,6 +61,7 @@ class Loops(eqx.Module):
             input_limits=jnp.asarray([elite.u_max for elite in elites]),
             state_limits=jnp.asarray(first.state_limits),
             intervals=len(first.u),
+            keep_out=first.keep_out,
         )
 
     def law(self, which: Int[Array, " L"], t: Float[Array, ""], x: tuple) -> list:
@@ -80,8 +83,11 @@ class Loops(eqx.Module):
         return u
 
     def inside(self, x: Float[Array, "n L"]) -> Bool[Array, " L"]:
-        """Whether the states keep the limits; what is no number does not."""
-        return jnp.all(jnp.abs(x) <= jnp.minimum(self.state_limits, jnp.finfo(x.dtype).max)[:, None], axis=0)
+        """Whether the states keep the limits, and out of the sets to keep out of; what is no number does not."""
+        inside = jnp.all(jnp.abs(x) <= jnp.minimum(self.state_limits, jnp.finfo(x.dtype).max)[:, None], axis=0)
+        for each in self.keep_out:
+            inside &= ~each.entered(x)
+        return inside
 
     def distance(self, which: Int[Array, " L"], x: Float[Array, "n L"]) -> Float[Array, " L"]:
         """V / rho of the goal's region."""

@@ -46,9 +46,11 @@ def claim_of(elite: Elite, bounds: Bounds | None = None) -> dict[str, Any]:
     of the cubic Hermite interpolant are f(x_k, u_k) and f(x_{k+1}, u_k), rounded to doubles.
 
     Raises:
-        UserError: a robot of which there is no claim, knots that are not evenly spaced, or a number that no claim can
-            hold.
+        UserError: a robot of which there is no claim, sets to keep out of, knots that are not evenly spaced, or a
+            number that no claim can hold.
     """
+    if elite.keep_out:
+        raise UserError("the task has sets to keep out of (task.keep_out), of which no certificate can state anything")
     robot = claimed_robot(elite)
     bounds = bounds or bounds_of(elite, UncertaintyConfig())
     claim = {

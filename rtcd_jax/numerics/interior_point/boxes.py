@@ -56,8 +56,12 @@ def push_inside(
 
 def boundary_step(values: Boxed, steps: Boxed, fraction: Float[Array, " P"]) -> Float[Array, " P"]:
     """Largest step <= 1 that keeps values + step above (1 - fraction) values: (15)."""
-    room = [
-        least(jnp.where(d < 0, -fraction * v / jnp.where(d < 0, d, -1.0), jnp.inf))
-        for v, d in zip(values, steps, strict=True)
-    ]
-    return jnp.minimum(1.0, jnp.minimum(jnp.minimum(room[0], room[1]), room[2]))
+    rooms = [room(v, d, fraction) for v, d in zip(values, steps, strict=True)]
+    return jnp.minimum(1.0, jnp.minimum(jnp.minimum(rooms[0], rooms[1]), rooms[2]))
+
+
+def room(
+    value: Float[Array, "*rest P"], step: Float[Array, "*rest P"], fraction: Float[Array, " P"]
+) -> Float[Array, " P"]:
+    """The largest length that keeps value + length step above (1 - fraction) value."""
+    return least(jnp.where(step < 0, -fraction * value / jnp.where(step < 0, step, -1.0), jnp.inf))

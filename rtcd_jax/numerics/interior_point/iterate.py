@@ -7,6 +7,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from rtcd_jax.numerics.interior_point.boxes import Boxed
+from rtcd_jax.numerics.interior_point.inequalities import Inequalities
 
 
 class Iterate(NamedTuple):
@@ -28,6 +29,7 @@ class Iterate(NamedTuple):
     cost: Float[Array, " P"]
     defects: Float[Array, "N n P"]
     solved: Bool[Array, " P"]
+    inequalities: Inequalities | None = None  # where there are sets to keep out of
 
 
 def where(condition: Bool[Array, " P"], yes: PyTree, no: PyTree) -> PyTree:

@@ -8,9 +8,11 @@ from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from rtcd_jax.numerics import kkt
 from rtcd_jax.numerics.interior_point.boxes import Boxed, log_sum, total
+from rtcd_jax.numerics.interior_point.inequalities import misfits
 from rtcd_jax.numerics.interior_point.iterate import Iterate, where
 from rtcd_jax.numerics.interior_point.model import Model
 from rtcd_jax.numerics.interior_point.problem import Settings
+from rtcd_jax.numerics.keep_out import Set
 
 
 class Direction(NamedTuple):
@@ -20,6 +22,7 @@ class Direction(NamedTuple):
     longest: Float[Array, " P"]
     descent: Float[Array, " P"]
     usable: Bool[Array, " P"]
+    slacks: Float[Array, "inner c P"] | None = None
 
     def point(
         self, it: Iterate, length: Float[Array, " P"]
@@ -59,11 +62,15 @@ class _Filter(NamedTuple):
     rounding: tuple  # of violation and merit
 
     @classmethod
-    def of(cls, it: Iterate, slacks: Boxed) -> "_Filter":
+    def of(cls, it: Iterate, slacks: Boxed, sets: tuple[Set, ...]) -> "_Filter":
         merit = it.cost - it.barrier * log_sum(slacks)
         eps = float(jnp.finfo(it.cost.dtype).eps)
         rounding = 10 * eps * it.defects[..., 0].size, 10 * eps * jnp.abs(merit)
-        return cls(total(jnp.abs(it.defects)), merit, jnp.maximum(1.0, it.violation_start), it.filter, rounding)
+        violation = total(jnp.abs(it.defects))
+        if it.inequalities is not None:
+            merit -= it.barrier * total(jnp.log(it.inequalities.slacks))
+            violation += total(jnp.abs(misfits(sets, it.inequalities.slacks, it.xs)))
+        return cls(violation, merit, jnp.maximum(1.0, it.violation_start), it.filter, rounding)
 
     def judge(
         self,
@@ -99,13 +106,17 @@ def line_search(
 
     After four failures in a row the filter is emptied and the last, short step taken.
     """
-    compared, usable = _Filter.of(it, slacks), direction.usable
+    compared, usable = _Filter.of(it, slacks, model.problem.keep_out), direction.usable
 
     def attempt(length):
         xs, us, h = direction.point(it, length)
         defects, cost = model.simulate(xs, us, h, parameters)
         violation = total(jnp.abs(defects))
         merit = cost - it.barrier * log_sum(model.slacks(model.values(xs, us, h)))
+        if it.inequalities is not None:
+            reached = it.inequalities.slacks + length * direction.slacks
+            merit -= it.barrier * total(jnp.log(reached))
+            violation += total(jnp.abs(misfits(model.problem.keep_out, reached, xs)))
         accepted, augment = compared.judge(length, direction.descent, violation, merit)
         finite = jnp.isfinite(merit) & jnp.isfinite(violation)
         return finite & accepted, _Trial(defects, cost, finite, augment)

@@ -6,6 +6,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from rtcd_jax.numerics.keep_out import Set
+
 
 class Settings(NamedTuple):
     """Tolerances and the constants of the method."""
@@ -50,6 +52,7 @@ class ControlProblem(NamedTuple):
     state_limits: np.ndarray
     input_limits: np.ndarray
     step_limits: tuple[float, float]
+    keep_out: tuple[Set, ...] = ()
 
 
 class Guess(NamedTuple):
