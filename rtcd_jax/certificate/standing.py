@@ -130,6 +130,9 @@ def difference(content: Mapping[str, Any], claim: Claim, elite: Elite) -> str:
             return text
     stored = claim_of(elite)
     largest = np.max(np.abs([float.fromhex(rate) for rate in np.ravel(stored["rates"])]))
+    theirs, ours = (about.get("keep_out", []) for about in (content, stored))
+    if check.digest(theirs) != check.digest(ours):
+        return f"keep_out has {len(theirs)} sets there, {len(ours)} in the elite, and these are not the same"
     for key in _OF_THE_LOOP:
         text = _difference(key, content[key], stored[key], RATE_ROUNDING * largest if key == "rates" else 0.0)
         if text:

@@ -13,6 +13,7 @@ folder and nothing else. Read it in this order:
     delay       feedback of old measurements, to first order
     saturation  what the motor gives, between two saturated laws
     funnel      the obligations of one interval of the funnel
+    keep_out    sets of states to keep out of
     push        the largest impulse
     goal        the obligations of the goal region
     version1    the two robots that files of version 1 name
@@ -32,7 +33,8 @@ x* is the cubic Hermite interpolant of the claimed states and rates, K linear be
 accepts, then with E(t) = {x*(t) + L(t) y : |y| <= 1} and
 G = {x_g + L_g y : |y| <= 1} of the certificate, every motion that is in E(t) at some t of [start, t_N] stays in E until
 t_N, is then in G, never leaves G, and comes and stays as close to x_g as reported; in E and G no state exceeds its
-limit; and x*(t) + M^-1 (motor) J is in E(t) for all t of [start, t_N] and |J| <= `push`.
+limit or is in a set of the claim's `keep_out`; and x*(t) + M^-1 (motor) J is in E(t) for all t of [start, t_N] and
+|J| <= `push`.
 
 PROOF. *Funnel.* In y, d/dt |y|^2 = 2 y'L^-1 (f - x*' - L'y). Let L = L(s), s in [-1, 1] the time of one interval,
 det L > 0; det M > 0 is shown for all angles and robots (robot.py). Then q = -2 c y' adj(L) (a + b (u + w) -
@@ -53,6 +55,8 @@ case. So |y| decreases wherever |y| = 1: no motion leaves E (x' is bounded, and 
 l >= rest. Where no w, noise or age acts, rest = 0, and q is divided by l^2 where u is free: the remainder of q is
 r l^2 + d l, where d bounds what does not vanish with l (x_g is a rounded multiple of pi), and |y| decreases wherever
 l > d / margin.
+*Sets to keep out of.* Each lies in a half space w'(x - c) > offset (keep_out.py), which E does not meet if
+offset - w'(x* - c) > 0 and its square > |L'w|^2, in s; G likewise.
 *Push.* |L^-1 (b / D) J| < 1 is (D det L)^2 > |adj(L) b J|^2, one inequality in s and the robot's numbers. QED
 
 Every number of a file is an exact double in hexadecimal notation. Digests show where a file was changed; the theorem
@@ -88,8 +92,10 @@ from rtcd_jax.certificate.check.funnel import (
     motion,
     require_bounds,
     require_jump,
+    require_kept_out,
 )
 from rtcd_jax.certificate.check.goal import GoalField, Shell, goal_delay, goal_field, goal_obligations, goal_speed
+from rtcd_jax.certificate.check.keep_out import Ellipsoid, HalfSpace
 from rtcd_jax.certificate.check.matrix import cofactors
 from rtcd_jax.certificate.check.push import cube, push_clearance, require_push
 from rtcd_jax.certificate.check.robot import (

@@ -2,6 +2,7 @@
 
 from typing import Any, NamedTuple
 
+from rtcd_jax.certificate.check.keep_out import Ellipsoid
 from rtcd_jax.certificate.check.robot import Equations, Robot
 from rtcd_jax.certificate.check.taylor import Space
 
@@ -13,7 +14,7 @@ class Claim(NamedTuple):
     `disturbance` bounds |w(t)|, `noise` [n] the errors of the measured state, `age` [s] how old a measurement that acts
     is, `speed` [input/s] how fast the feedback changes. Where old measurements count to first order (delay.py), `jerk`
     [input/s^2], `reaction` [1/s] and, by knot, `jumps` [input/s] bound how that changes; else `jerk` is None. A motion
-    on x* survives an impulse of |J| <= `push` [input s] on the motor.
+    on x* survives an impulse of |J| <= `push` [input s] on the motor. No motion enters the sets of `keep_out`.
     """
 
     equations: Equations
@@ -36,6 +37,7 @@ class Claim(NamedTuple):
     K_goal: list
     start: tuple[int, Any]
     push: Any
+    keep_out: list = []  # noqa: RUF012 (of a tuple's field)
 
     @property
     def robot(self) -> Robot:
@@ -44,6 +46,11 @@ class Claim(NamedTuple):
     @property
     def n(self) -> int:
         return len(self.x_goal)
+
+    @property
+    def ellipsoids(self) -> list[Ellipsoid]:
+        """Those of the sets to keep out of."""
+        return [each for each in self.keep_out if isinstance(each, Ellipsoid)]
 
     @property
     def uncertain(self) -> list[str]:

@@ -23,6 +23,7 @@ from rtcd_jax.certificate.check.exact import (
 )
 from rtcd_jax.certificate.check.funnel import Interval
 from rtcd_jax.certificate.check.goal import Shell
+from rtcd_jax.certificate.check.keep_out import Ellipsoid, HalfSpace
 from rtcd_jax.certificate.check.robot import (
     HINGE,
     SLIDE,
@@ -133,9 +134,11 @@ def read_claim(node: Node) -> Claim:
     if isinstance(node.value, dict) and "plant" in node.value:
         return _read_claim_1(node)
     first_order = isinstance(node.value, dict) and "jerk" in node.value
+    kept_out = isinstance(node.value, dict) and "keep_out" in node.value
     names = (
         *("robot", "parameters", "limit", "disturbance", "noise", "age", "speed", *_LOOP, "push"),
         *(("jerk", "reaction", "jumps") if first_order else ()),
+        *(("keep_out",) if kept_out else ()),
     )
     entries: dict[str, Node] = dict(zip(names, node.keys(*names), strict=True))
     node.require_digests()
@@ -168,7 +171,34 @@ def read_claim(node: Node) -> Claim:
         jumps=[_at_least_zero(each) for each in entries["jumps"].items(len(entries["u"].items()))]
         if first_order
         else [],
+        keep_out=[_read_set(each, n) for each in entries["keep_out"].items(at_least=1)] if kept_out else [],
     )
+
+
+def _read_set(node: Node, n: int) -> HalfSpace | Ellipsoid:
+    half = isinstance(node.value, dict) and "normal" in node.value
+    names = ("normal", "offset") if half else ("center", "semi_axes")
+    holds = isinstance(node.value, dict) and node.value.keys() == set(names)
+    node.require(holds, f"must have the keys {', '.join(names)}")
+    place, size = (Node(f"{node.place}.{name}", node.value[name]) for name in names)
+    if half:
+        return HalfSpace(place.array(n), size.number())
+    center, axes = place.array(n), []
+    for each in size.items(n):
+        axes.append(None if each.value is None else each.number())
+        each.require(axes[-1] is None or axes[-1] > 0, "must be > 0")
+    return Ellipsoid(center, axes)
+
+
+def _read_sides(node: Node, claim: Claim, ends: int) -> list[tuple]:
+    """Of every ellipsoid to keep out of, its side at each of the `ends`."""
+    sides, ellipsoids = [], claim.ellipsoids
+    for each, ellipsoid in zip(node.items(len(ellipsoids)), ellipsoids, strict=True):
+        sides.append([row.array(claim.n) for row in each.items(ends)])
+        infinite = [i for i, axis in enumerate(ellipsoid.semi_axes) if axis is None]
+        flat = all(row[i] == 0 for row in sides[-1] for i in infinite)
+        each.require(flat, "must be zero where the ellipsoid has no end")
+    return sides
 
 
 _LOOP = ("state_limits", "dt", "x", "rates", "u", "K", "x_goal", "K_goal", "start")
@@ -295,8 +325,9 @@ def require_few_terms(node: Node, n: int, s_order: int, y_order: int) -> None:
 
 
 def read_interval(node: Node, claim: Claim) -> Interval:
-    knot, start, end, first, last, bend, orders, cases, *late = node.keys(
-        *("knot", "start", "end", "first", "last", "bend", "orders", "cases"), *(("late",) if claim.first_order else ())
+    others = (*(("late",) if claim.first_order else ()), *(("sides",) if claim.ellipsoids else ()))
+    knot, start, end, first, last, bend, orders, cases, *more = node.keys(
+        *("knot", "start", "end", "first", "last", "bend", "orders", "cases"), *others
     )
     node.require_digests()
     n = claim.n
@@ -304,7 +335,8 @@ def read_interval(node: Node, claim: Claim) -> Interval:
     require_few_terms(orders, n, *pair)
     interval = Interval(
         knot.integer(0, len(claim.u) - 1), start.number(), end.number(), first.array(n, n), last.array(n, n),
-        bend.array(2, n, n), (pair[0], pair[1]), read_cases(cases, n), late[0].array(2, n) if late else [],
+        bend.array(2, n, n), (pair[0], pair[1]), read_cases(cases, n), more[0].array(2, n) if claim.first_order else [],
+        _read_sides(more[-1], claim, 2) if claim.ellipsoids else [],
     )  # fmt: skip
     node.require(
         0 <= interval.start < interval.end <= 1, "must start before it ends, at fractions of its interval in [0, 1]"
@@ -322,7 +354,7 @@ def _read_shell(node: Node, n: int) -> Shell:
 
 class Goal(NamedTuple):
     """Axes of the goal region, order of its Taylor models, weight of the S-lemma; the shells cover [rest, 1]. `late` is
-    rho of delay.py where old measurements count to first order.
+    rho of delay.py where old measurements count to first order, `sides` are those of keep_out.py.
     """
 
     axes: list
@@ -331,13 +363,18 @@ class Goal(NamedTuple):
     rest: Any
     shells: list[Shell]
     late: list
+    sides: list
 
 
 def read_goal(node: Node, claim: Claim) -> Goal:
     """The goal region; that of a file of version 1 has no `rest`, and its shells begin at 0."""
     names = ("axes", "order", "weight", "shells")
     ended = isinstance(node.value, dict) and "rest" in node.value
-    others = (*(("rest",) if ended else ()), *(("late",) if claim.first_order else ()))
+    others = (
+        *(("rest",) if ended else ()),
+        *(("late",) if claim.first_order else ()),
+        *(("sides",) if claim.ellipsoids else ()),
+    )
     axes, order, weight, items, *more = node.keys(*names, *others)
     rest = more[0].number() if ended else Q(0)
     shells, reached = [_read_shell(item, claim.n) for item in items.items(at_least=1)], rest
@@ -352,8 +389,11 @@ def read_goal(node: Node, claim: Claim) -> Goal:
         reached = shell.end
     items.require(reached == 1, f"ends at {rounded(reached):g}, must end at 1")
     require_few_terms(order, claim.n, MAX_ORDER, order.integer(2, MAX_ORDER - 2))
-    return Goal(axes.array(claim.n, claim.n), order.value, weight.number(), rest, shells,
-                more[-1].array(claim.n) if claim.first_order else [])  # fmt: skip
+    return Goal(
+        axes.array(claim.n, claim.n), order.value, weight.number(), rest, shells,
+        more[int(ended)].array(claim.n) if claim.first_order else [],
+        _read_sides(more[-1], claim, 1) if claim.ellipsoids else [],
+    )  # fmt: skip
 
 
 def read_notes(node: Node) -> dict[str, str]:

@@ -15,6 +15,7 @@ from rtcd_jax.certificate.check.delay import (
 )
 from rtcd_jax.certificate.check.delay import Bounds as DelayBounds
 from rtcd_jax.certificate.check.exact import Q, alternating, near, require, rounded
+from rtcd_jax.certificate.check.keep_out import half_spaces
 from rtcd_jax.certificate.check.matrix import cofactors, dot
 from rtcd_jax.certificate.check.saturation import Case, cases_of, input_error
 from rtcd_jax.certificate.check.squares import GramCertificate, Obligation, control_points, is_positive
@@ -50,6 +51,8 @@ class Interval(NamedTuple):
     cases: dict[str, GramCertificate]
     late: list
     """rho of delay.py at both ends, linear in between, where old measurements count to first order."""
+    sides: list = []  # noqa: RUF012 (of a tuple's field)
+    """Of every ellipsoid to keep out of, the side of keep_out.py at both ends."""
 
 
 def motion(claim: Claim, interval: Interval) -> Motion:
@@ -260,3 +263,20 @@ def require_bounds(claim: Claim, data: Motion, place: str) -> None:
             inside = is_positive(left, WHOLE) and is_positive(clearance, WHOLE)
             name = claim.robot.states[i]
             require(inside, place, f"the limit |{name}| <= {rounded(bound):.6g} {claim.robot.units[i]} is not kept")
+
+
+def require_kept_out(claim: Claim, interval: Interval, data: Motion, place: str) -> None:
+    """The ellipsoids meet no half space w'(x - c) > offset that holds a set to keep out of:
+    (offset - w'(x* - c))^2 > |L'w|^2 and offset - w'(x* - c) > 0.
+    """
+    space = claim.space(*interval.orders)
+    sides = [
+        ([space.compose([(a + b) / 2, (b - a) / 2], space.s) for a, b in zip(*ends, strict=True)], ends)
+        for ends in interval.sides
+    ]
+    for i, (normal, center, offset) in enumerate(half_spaces(claim.keep_out, sides)):
+        apart = [space.poly(c) - x for c, x in zip(center, data.state, strict=True)]
+        left = dot(apart, normal) + space.poly(offset)
+        turned = [dot(column, normal) for column in zip(*data.axes, strict=True)]
+        outside = is_positive(left, WHOLE) and is_positive(left * left - dot(turned, turned), WHOLE)
+        require(outside, place, f"the set claim.keep_out[{i}] is not kept out of")

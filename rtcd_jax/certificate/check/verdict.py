@@ -18,8 +18,16 @@ from rtcd_jax.certificate.check.file import (
     read_interval,
     read_notes,
 )
-from rtcd_jax.certificate.check.funnel import Interval, funnel_obligations, motion, require_bounds, require_jump
+from rtcd_jax.certificate.check.funnel import (
+    Interval,
+    funnel_obligations,
+    motion,
+    require_bounds,
+    require_jump,
+    require_kept_out,
+)
 from rtcd_jax.certificate.check.goal import goal_field, goal_obligations, require_arrival
+from rtcd_jax.certificate.check.keep_out import Ellipsoid, HalfSpace, half_spaces
 from rtcd_jax.certificate.check.matrix import cofactors, dot
 from rtcd_jax.certificate.check.push import require_push
 from rtcd_jax.certificate.check.robot import Robot
@@ -57,7 +65,9 @@ def margins(todo: Mapping[str, Obligation], cases: Mapping[str, GramCertificate]
 
 def check_interval(claim: Claim, interval: Interval, place: str):
     """The margin of one interval's proof."""
-    require_bounds(claim, motion(claim, interval), place)
+    data = motion(claim, interval)
+    require_bounds(claim, data, place)
+    require_kept_out(claim, interval, data, place)
     if claim.push != 0:
         require_push(claim, interval, place)
     if claim.first_order:
@@ -85,6 +95,12 @@ def check_goal(claim: Claim, node: Node, outlet: list) -> tuple[Goal, list, Any]
         left = None if bound is None else bound - abs(claim.x_goal[i])
         inside = left is None or (left > 0 and left * left > dot(goal.axes[i], goal.axes[i]))
         require(inside, f"{node.place}.axes", f"the limit on |{claim.robot.states[i]}| is not kept")
+    sides = [(ends[0], ends) for ends in goal.sides]
+    for i, (normal, center, offset) in enumerate(half_spaces(claim.keep_out, sides)):
+        left = offset + dot([c - x for c, x in zip(center, claim.x_goal, strict=True)], normal)
+        turned = [dot(normal, column) for column in zip(*goal.axes, strict=True)]
+        outside = left > 0 and left * left > dot(turned, turned)
+        require(outside, f"{node.place}.axes", f"the set claim.keep_out[{i}] is not kept out of")
     field = goal_field(claim, goal.axes, goal.order, node.place, goal.late)
     require_arrival(claim, outlet, goal.axes, goal.weight, f"{node.place}.axes")
     least, drift = None, Q(0)
@@ -181,7 +197,12 @@ def sentence(report: Report) -> str:
         return f"{place} " + ", ".join(f"{state} +-{value:.3g} {unit}" for state, value, unit in triples)
 
     limits = [(s, b, u) for s, b, u in zip(robot.states, claim.bounds, robot.units, strict=True) if b is not None]
-    bounds = " and ".join(f"|{state}| <= {float(bound):.6g} {unit}" for state, bound, unit in limits)
+    bounds = " and ".join(
+        [
+            *(f"|{state}| <= {float(bound):.6g} {unit}" for state, bound, unit in limits),
+            *(_outside(each, robot.states) for each in claim.keep_out),
+        ]
+    )
     least, largest = (f"{float(limit):.6g}" for limit in claim.limits)
     limit = (
         f"{largest} {robot.input_unit}" if least == largest else f"a limit in [{least}, {largest}] {robot.input_unit}"
@@ -208,6 +229,16 @@ def sentence(report: Report) -> str:
         f"intervals of time and {report.shells} of level, smallest margin {report.margin:.2g}. It is a statement about "
         f"{_reservation(claim)}, not about hardware. Claim: sha256 {report.digest}."
     )
+
+
+def _outside(each: HalfSpace | Ellipsoid, states: Sequence[str]) -> str:
+    """That a state is not in a set, as an inequality."""
+    if isinstance(each, HalfSpace):
+        terms = [f"{rounded(a):.6g} {state}" for a, state in zip(each.normal, states, strict=True) if a != 0]
+        return f"{' + '.join(terms)} <= {rounded(each.offset):.6g}"
+    parts = zip(states, each.center, each.semi_axes, strict=True)
+    terms = [f"(({state} - {rounded(c):.6g}) / {rounded(a):.6g})^2" for state, c, a in parts if a is not None]
+    return f"{' + '.join(terms)} >= 1"
 
 
 def _printable(claim: Claim) -> Claim:

@@ -1509,6 +1509,22 @@ Q margin(const Obligation& todo, const Gram& proof, int n, const string& place) 
 
 // The claim ------------------------------------------------------------------------------------------------------------
 
+// A set to keep out of: {x : normal'x > offset}, or {x : sum_i ((x_i - center_i) / semi_axes_i)^2 < 1}.
+struct KeptOut {
+  bool half = false;
+  Row normal, center;
+  Q offset;
+  vector<std::optional<Q>> semi_axes;  // without one: infinite
+
+  // An upper bound of the largest w'(x - center) in the ellipsoid.
+  Q support(const Row& w) const {
+    Q square = 0;
+    for (size_t i = 0; i < w.size(); i++)
+      if (semi_axes[i]) square += *semi_axes[i] * *semi_axes[i] * w[i] * w[i];
+    return exactly(root_up(square));
+  }
+};
+
 struct Claim {
   Robot robot;
   vector<std::pair<string, std::pair<Q, Q>>> parameters;  // in the file's order
@@ -1522,7 +1538,11 @@ struct Claim {
   vector<Matrix> rates;
   long first_knot = 0;
   vector<string> uncertain;
+  vector<KeptOut> keep_out;
 
+  size_t ellipsoids() const {
+    return size_t(std::count_if(keep_out.begin(), keep_out.end(), [](const KeptOut& each) { return !each.half; }));
+  }
   size_t n() const { return x_goal.size(); }
   bool moves_the_goal() const {
     return disturbance != 0 || age != 0 || std::any_of(noise.begin(), noise.end(), [](const Q& e) { return e != 0; });
@@ -1825,6 +1845,7 @@ struct Interval {
   int orders[2];
   vector<string> names;
   std::map<string, Gram> cases;
+  vector<Matrix> sides;  // of every ellipsoid to keep out of: the normals of half spaces that hold it, at both ends
 };
 
 struct Motion {  // on one interval, in s
@@ -1871,6 +1892,25 @@ void require_bounds(const Claim& claim, const Motion& on, const string& place) {
       require(inside, place, "the limit |" + printable(claim.robot.states[i]) + "| <= " +
                                  formatted("%.6g", rounded(*claim.bounds[i])) + " " + printable(claim.robot.units[i]) + " is not kept");
     }
+  }
+}
+
+// Every set lies in a half space w'(x - c) > offset, with w linear in s, which the ellipsoids do not meet.
+void require_kept_out(const Claim& claim, const Interval& piece, const Motion& on, const string& place) {
+  size_t n = claim.n(), ellipsoid = 0;
+  for (size_t j = 0; j < claim.keep_out.size(); j++) {
+    const KeptOut& each = claim.keep_out[j];
+    Matrix ends = each.half ? Matrix{each.normal, each.normal} : piece.sides[ellipsoid++];
+    Curve left{each.half ? each.offset : Q(-std::max(each.support(ends[0]), each.support(ends[1])))};
+    vector<Curve> w, turned(n, Curve{0});
+    for (size_t i = 0; i < n; i++) {
+      w.push_back({(ends[0][i] + ends[1][i]) / 2, (ends[1][i] - ends[0][i]) / 2});
+      left = left + w[i] * (Curve{each.half ? Q(0) : each.center[i]} - on.state[i]);
+    }
+    for (size_t column = 0; column < n; column++)
+      for (size_t i = 0; i < n; i++) turned[column] = turned[column] + w[i] * on.axes[i][column];
+    bool outside = is_positive(left) && is_positive(left * left - dot(turned, turned));
+    require(outside, place, "the set claim.keep_out[" + std::to_string(j) + "] is not kept out of");
   }
 }
 
@@ -2056,6 +2096,7 @@ struct Goal {
   Q weight, rest;
   vector<Shell> shells;
   Row late;
+  vector<Matrix> sides;
 };
 
 struct GoalField {  // 2 y' adj(L) a / l and 2 y' adj(L) b / l times a constant > 0, after y = l z
@@ -2296,6 +2337,38 @@ Claim read_claim_1(const Node& node) {
   return claim;
 }
 
+KeptOut read_set(const Node& node, long n) {
+  KeptOut out;
+  out.half = node.has("normal");
+  node.exactly(out.half ? vector<string>{"normal", "offset"} : vector<string>{"center", "semi_axes"});
+  if (out.half) {
+    out.normal = node.at("normal").row(n), out.offset = node.at("offset").number();
+    return out;
+  }
+  out.center = node.at("center").row(n);
+  for (auto& each : node.at("semi_axes").items(n)) {
+    out.semi_axes.push_back(each.is(Value::NUL) ? std::optional<Q>() : each.number());
+    each.require(!out.semi_axes.back() || *out.semi_axes.back() > 0, "must be > 0");
+  }
+  return out;
+}
+
+// Of every ellipsoid to keep out of, its side at each of the ends.
+vector<Matrix> read_sides(const Node& node, const Claim& claim, long ends) {
+  vector<Matrix> sides;
+  auto nodes = node.items(long(claim.ellipsoids()));
+  for (auto& each : claim.keep_out) {
+    if (each.half) continue;
+    const Node& here = nodes[sides.size()];
+    sides.push_back(here.matrix(ends, long(claim.n())));
+    bool flat = true;
+    for (auto& row : sides.back())
+      for (size_t i = 0; i < row.size(); i++) flat = flat && (each.semi_axes[i] || row[i] == 0);
+    here.require(flat, "must be zero where the ellipsoid has no end");
+  }
+  return sides;
+}
+
 Claim read_claim_2(const Node& node) {
   vector<string> names{"robot", "parameters", "limit", "disturbance", "noise", "age", "speed"};
   names.insert(names.end(), LOOP.begin(), LOOP.end());
@@ -2303,6 +2376,7 @@ Claim read_claim_2(const Node& node) {
   Claim claim;
   claim.first_order = node.has("jerk");
   if (claim.first_order) names.insert(names.end(), {"jerk", "reaction", "jumps"});
+  if (node.has("keep_out")) names.push_back("keep_out");
   node.keys(names);
   node.digests();
   claim.robot = read_robot(node.at("robot"));
@@ -2328,6 +2402,8 @@ Claim read_claim_2(const Node& node) {
     claim.jerk = node.at("jerk").at_least_zero(), claim.reaction = node.at("reaction").at_least_zero();
     for (auto& each : node.at("jumps").items(long(node.at("u").items().size()))) claim.jumps.push_back(each.at_least_zero());
   }
+  if (node.has("keep_out"))
+    for (auto& each : node.at("keep_out").items(-1, 1)) claim.keep_out.push_back(read_set(each, long(claim.robot.states.size())));
   read_loop(node, claim);
   return claim;
 }
@@ -2381,6 +2457,7 @@ void require_few_terms(const Node& node, long n, long s_order, long y_order) {
 Interval read_interval(const Node& node, const Claim& claim) {
   vector<string> names{"knot", "start", "end", "first", "last", "bend", "orders", "cases"};
   if (claim.first_order) names.push_back("late");
+  if (claim.ellipsoids()) names.push_back("sides");
   node.keys(names);
   node.digests();
   long n = long(claim.n());
@@ -2395,6 +2472,7 @@ Interval read_interval(const Node& node, const Claim& claim) {
   for (int i : {0, 1}) piece.bend[i] = bend[size_t(i)].matrix(n, n);
   read_cases(node.at("cases"), int(n), piece.names, piece.cases);
   if (claim.first_order) piece.late = node.at("late").matrix(2, n);
+  if (claim.ellipsoids()) piece.sides = read_sides(node.at("sides"), claim, 2);
   node.require(0 <= piece.start && piece.start < piece.end && piece.end <= 1,
                "must start before it ends, at fractions of its interval in [0, 1]");
   return piece;
@@ -2405,6 +2483,7 @@ Goal read_goal(const Node& node, const Claim& claim) {
   bool ended = node.has("rest");
   if (ended) names.push_back("rest");
   if (claim.first_order) names.push_back("late");
+  if (claim.ellipsoids()) names.push_back("sides");
   node.keys(names);
   Goal goal;
   if (ended) goal.rest = node.at("rest").number();
@@ -2432,6 +2511,7 @@ Goal read_goal(const Node& node, const Claim& claim) {
   goal.axes = node.at("axes").matrix(long(claim.n()), long(claim.n()));
   goal.weight = node.at("weight").number();
   if (claim.first_order) goal.late = node.at("late").row(long(claim.n()));
+  if (claim.ellipsoids()) goal.sides = read_sides(node.at("sides"), claim, 1);
   return goal;
 }
 
@@ -2521,6 +2601,19 @@ Report check(const Value& content) {
     const Row& row = goal.axes[size_t(i)];
     require(left > 0 && left * left > dot(row, row), at_goal + ".axes", "the limit on |" + printable(claim.robot.states[size_t(i)]) + "| is not kept");
   }
+  size_t ellipsoid = 0;
+  for (size_t j = 0; j < claim.keep_out.size(); j++) {
+    const KeptOut& each = claim.keep_out[j];
+    const Row w = each.half ? each.normal : goal.sides[ellipsoid++][0];
+    Q left = each.half ? each.offset : Q(-each.support(w)), square = 0;
+    for (size_t i = 0; i < size_t(n); i++) left += w[i] * ((each.half ? Q(0) : each.center[i]) - claim.x_goal[i]);
+    for (size_t column = 0; column < size_t(n); column++) {
+      Q turned = 0;
+      for (size_t i = 0; i < size_t(n); i++) turned += w[i] * goal.axes[i][column];
+      square += turned * turned;
+    }
+    require(left > 0 && left * left > square, at_goal + ".axes", "the set claim.keep_out[" + std::to_string(j) + "] is not kept out of");
+  }
   GoalField field;
   goal_field(claim, goal, at_goal, field);
   require_arrival(claim, funnel.back().last, goal, at_goal + ".axes");
@@ -2541,6 +2634,7 @@ Report check(const Value& content) {
     string here = place + "[" + std::to_string(i) + "]";
     Motion on = motion(claim, funnel[i]);
     require_bounds(claim, on, here);
+    require_kept_out(claim, funnel[i], on, here);
     if (claim.push != 0) require_push(claim, funnel[i], on, here);
     if (claim.first_order) require_jump(claim, funnel[i], here);
     auto todo = funnel_obligations(claim, funnel[i], on, here);
@@ -2603,6 +2697,15 @@ string sentence(const Report& report) {
   for (size_t i = 0; i < claim.n(); i++)
     if (claim.bounds[i])
       bounds += (bounds.empty() ? "" : " and ") + ("|" + printable(robot.states[i]) + "| <= " + number(*claim.bounds[i]) + " " + printable(robot.units[i]));
+  for (auto& each : claim.keep_out) {
+    string terms;
+    for (size_t i = 0; i < claim.n(); i++) {
+      string state = printable(robot.states[i]), plus = terms.empty() ? "" : " + ";
+      if (each.half && each.normal[i] != 0) terms += plus + number(each.normal[i]) + " " + state;
+      if (!each.half && each.semi_axes[i]) terms += plus + "((" + state + " - " + number(each.center[i]) + ") / " + number(*each.semi_axes[i]) + ")^2";
+    }
+    bounds += (bounds.empty() ? "" : " and ") + terms + (each.half ? " <= " + number(each.offset) : " >= 1");
+  }
   string least = number(claim.limits.first), largest = number(claim.limits.second);
   string limit = least == largest ? largest + " " + input : "a limit in [" + least + ", " + largest + "] " + input;
   if (claim.disturbance != 0) acts += ", for every disturbance |w(t)| <= " + number(claim.disturbance) + " " + input + " on top of the motor";

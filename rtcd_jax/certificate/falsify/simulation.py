@@ -9,7 +9,7 @@ the input meets its limit, so the order is two at least and that difference is 3
 """
 
 import itertools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple, final
 
@@ -146,7 +146,7 @@ class Motions:
         places = np.searchsorted(lengths / lengths[-1], (np.arange(count) + 0.5) / count)
         y, x = _ball(self.n, count, random), np.empty((self.n, count))
         drawn = draw(self.claim, count, self.beyond, random)
-        flight = _Flight(self._bounds, x, x[:, ::REPEATED].copy(), drawn, random)
+        flight = _Flight(self._bounds, self.claim.keep_out, x, x[:, ::REPEATED].copy(), drawn, random)
         for place, interval in enumerate(self.intervals):
             before, after = np.searchsorted(places, (place, place + 1))
             fraction = random.uniform(interval.start, interval.end)
@@ -269,12 +269,20 @@ class Motions:
 class _Flight:
     """Motions under way: their states [n M], every `REPEATED`-th by halved steps, and their results so far."""
 
-    def __init__(self, bounds: np.ndarray, x: np.ndarray, again: np.ndarray, drawn: Drawn, random: np.random.Generator):
+    def __init__(
+        self,
+        bounds: np.ndarray,
+        keep_out: Sequence[check.HalfSpace | check.Ellipsoid],
+        x: np.ndarray,
+        again: np.ndarray,
+        drawn: Drawn,
+        random: np.random.Generator,
+    ):
         self.x, self.again, self.error = x, again, 0.0
         self.drawn, self.random = drawn, random
         self.level, self.share_of_limit = np.zeros(x.shape[1]), np.zeros(x.shape[1])
         self._limited = np.isfinite(bounds)
-        self._bounds = bounds[self._limited, None]
+        self._bounds, self._keep_out = bounds[self._limited, None], keep_out
 
     def measure(self, center: np.ndarray, inward: np.ndarray, who: slice, again: slice) -> None:
         """|y| at an instant of the funnel; `inward` is L^-1."""
@@ -290,6 +298,17 @@ class _Flight:
         if self._limited.any():
             fraction = np.max(np.abs(x[self._limited]) / self._bounds, axis=0)
             self.share_of_limit[who] = np.maximum(self.share_of_limit[who], fraction)
+        for each in self._keep_out:
+            self.share_of_limit[who] = np.maximum(self.share_of_limit[who], _share(each, x))
+
+
+def _share(each: check.HalfSpace | check.Ellipsoid, x: np.ndarray) -> np.ndarray:
+    """Above 1 exactly in the set, of states [n M]; of a half space by the distance along its normal."""
+    if isinstance(each, check.HalfSpace):
+        normal = _floats(each.normal)
+        return 1 + (normal @ x - float(each.offset)) / np.linalg.norm(normal)
+    axes = np.array([np.inf if axis is None else float(axis) for axis in each.semi_axes])
+    return 1 / np.linalg.norm((x - _floats(each.center)[:, None]) / axes[:, None], axis=0)
 
 
 def _ball(n: int, count: int, random: np.random.Generator) -> np.ndarray:

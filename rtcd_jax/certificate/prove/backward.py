@@ -103,7 +103,9 @@ class BackwardProof:
     def _attempt(self, k: int, start: float, end: float, state: ProofState, decay_margin: float) -> Proved | None:
         try:
             interval, rho = self._interval(k, start, end, state, decay_margin)
-            check.require_bounds(self.claim, check.motion(self.claim, interval), "limits")
+            data = check.motion(self.claim, interval)
+            check.require_bounds(self.claim, data, "limits")
+            check.require_kept_out(self.claim, interval, data, "sets")
             if self.claim.first_order:
                 check.require_jump(self.claim, interval, "jumps")
             interval, todo, degree = self._models(interval, decay_margin)
@@ -129,7 +131,8 @@ class BackwardProof:
         fractions = check.rational(start), check.rational(end)
         order = TIERS[self.claim.n][0][0]
         late = loop.late_rows(k, start, end) if self.claim.first_order else []
-        return Interval(k, *fractions, on_grid(a), state.axes, bend, (TIME_ORDER, order), {}, late), rho
+        sides = loop.sides(k, start, end)
+        return Interval(k, *fractions, on_grid(a), state.axes, bend, (TIME_ORDER, order), {}, late, sides), rho
 
     def _models(self, interval: Interval, decay_margin: float) -> tuple[Interval, dict[str, Obligation], int]:
         """The interval's obligations by the cheapest Taylor models that are good enough."""

@@ -25,6 +25,7 @@ from rtcd_jax.certificate.prove.uncertainty import bounds_of, uncertainty_of
 from rtcd_jax.certificate.standing import accepted, remember, standing_of
 from rtcd_jax.config.schema import UncertaintyConfig
 from rtcd_jax.elite.elite import Elite
+from rtcd_jax.system.errors import UserError
 from rtcd_jax.system.files import held, removed, replace
 from rtcd_jax.system.journal import Journal
 
@@ -116,6 +117,8 @@ def _certified(
     """`certify_elite` of an elite that no other process is at."""
     began = time.perf_counter()
     elite = Elite.read(run, name)
+    if optimize_value and elite.keep_out:
+        raise UserError(f"--optimize_value: {run} has sets to keep out of (task.keep_out), which it does not know")
     bounds, folder = bounds_of(elite, uncertainty_of(elite, uncertainty)), run / target
     loop_record = claim_of(elite, bounds)
     misfits: tuple[Any, ...] = ()
@@ -279,6 +282,7 @@ def _interval_record(interval: check.Interval) -> dict[str, Any]:
             "orders": list(interval.orders),
             "cases": _cases_record(interval.cases),
             **({"late": _matrix(interval.late)} if interval.late else {}),
+            **_sides_record(interval.sides),
         }
     )
 
@@ -293,7 +297,12 @@ def _goal_record(region: GoalRegion) -> dict[str, Any]:
     ]
     record = {"axes": _matrix(region.axes), "order": region.order, "weight": double(weight)}
     late = {"late": [double(c) for c in region.late]} if region.late else {}
-    return with_digests({**record, "rest": double(region.rest), "shells": shells, **late})
+    others = {**late, **_sides_record(region.sides)}
+    return with_digests({**record, "rest": double(region.rest), "shells": shells, **others})
+
+
+def _sides_record(sides: list) -> dict[str, Any]:
+    return {"sides": [_matrix(each) for each in sides]} if sides else {}
 
 
 def _cases_record(cases: Mapping[str, GramCertificate]) -> dict[str, Any]:

@@ -4,9 +4,10 @@ from collections.abc import Callable, Mapping, Sequence
 from copy import copy
 from functools import lru_cache
 from math import comb
-from typing import Any, NamedTuple, final
+from typing import Any, NamedTuple, cast, final
 
 import numpy as np
+from scipy.optimize import brentq
 
 from rtcd_jax.certificate import check
 from rtcd_jax.certificate.prove.robot import ClaimedRobot, claimed_robot
@@ -15,6 +16,7 @@ from rtcd_jax.config.schema import UncertaintyConfig
 from rtcd_jax.elite.elite import Elite
 from rtcd_jax.elite.funnel import value_rates
 from rtcd_jax.numerics.hermite import cubic_hermite, cubic_hermite_rate
+from rtcd_jax.numerics.keep_out import Ellipsoid, HalfSpace
 from rtcd_jax.system.errors import UserError
 
 GRID = 34
@@ -46,11 +48,9 @@ def claim_of(elite: Elite, bounds: Bounds | None = None) -> dict[str, Any]:
     of the cubic Hermite interpolant are f(x_k, u_k) and f(x_{k+1}, u_k), rounded to doubles.
 
     Raises:
-        UserError: a robot of which there is no claim, sets to keep out of, knots that are not evenly spaced, or a
-            number that no claim can hold.
+        UserError: a robot of which there is no claim, knots that are not evenly spaced, or a number that no claim can
+            hold.
     """
-    if elite.keep_out:
-        raise UserError("the task has sets to keep out of (task.keep_out), of which no certificate can state anything")
     robot = claimed_robot(elite)
     bounds = bounds or bounds_of(elite, UncertaintyConfig())
     claim = {
@@ -62,6 +62,7 @@ def claim_of(elite: Elite, bounds: Bounds | None = None) -> dict[str, Any]:
         "age": double(bounds.age),
         "speed": double(0.0),
         **_loop_record(elite, robot),
+        **({"keep_out": [_set_record(each) for each in elite.keep_out]} if elite.keep_out else {}),
     }
     rest = {"start": [0, double(0.0)], "push": double(0.0)}
     try:
@@ -69,6 +70,13 @@ def claim_of(elite: Elite, bounds: Bounds | None = None) -> dict[str, Any]:
     except check.Refused as refused:
         raise UserError(str(refused)) from None
     return claim
+
+
+def _set_record(each: HalfSpace | Ellipsoid) -> dict[str, Any]:
+    if isinstance(each, HalfSpace):
+        return {"normal": doubles(each.normal), "offset": double(each.offset)}
+    axes = [double(axis) if np.isfinite(axis) else None for axis in each.semi_axes]
+    return {"center": doubles(each.center), "semi_axes": axes}
 
 
 def _loop_record(elite: Elite, robot: ClaimedRobot) -> dict[str, Any]:
@@ -230,6 +238,7 @@ class Loop:
         self.x, self.rates, self.u = floats(claim.x), floats(claim.rates), floats(claim.u)
         self.gains, self.goal, self.goal_gain = floats(claim.K), floats(claim.x_goal), floats(claim.K_goal)
         self.bounds = np.array([np.inf if b is None else float(b) for b in claim.bounds])
+        self.keep_out = elite.keep_out
         self.values = elite.S
         a, b = np.zeros((len(self.u), 2, self.n, self.n)), np.zeros((len(self.u), 2, self.n, 1))
         for k, u in enumerate(self.u):
@@ -335,14 +344,37 @@ class Loop:
         return self.bounds - np.abs(center)
 
     def box_level(self, k: int, fraction: float) -> float:
-        """The level of the ellipsoid that touches a limit on the states."""
-        return _touching(self.clearance(k, fraction), self.value(k, fraction)[0])
+        """The level of the ellipsoid that touches a limit on the states or a set to keep out of.
+
+        Raises:
+            Refused: x* is in such a set.
+        """
+        s, _ = self.value(k, fraction)
+        return self._clear(_touching(self.clearance(k, fraction), s), self.nominal(k, fraction)[0], s)
+
+    def sides(self, k: int, start: float, end: float) -> list[list]:
+        """Of every ellipsoid to keep out of, the normals [2 n] of half spaces that hold it, at both ends of a part of
+        an interval: those between it and the ellipsoids that touch it.
+        """
+        ends = [(self.nominal(k, fraction)[0], self.value(k, fraction)[0]) for fraction in (start, end)]
+        return [on_grid(np.array([_touched(each, *end)[1] for end in ends])) for each in self._ellipsoids]
+
+    def goal_sides(self) -> list[list]:
+        """As `sides`, at the goal."""
+        return [on_grid(_touched(each, self.goal, self.values[-1])[1][None]) for each in self._ellipsoids]
+
+    @property
+    def _ellipsoids(self) -> list[Ellipsoid]:
+        return [each for each in self.keep_out if isinstance(each, Ellipsoid)]
+
+    def _clear(self, level: float, center: np.ndarray, s: np.ndarray) -> float:
+        return min([level, *(_touched(each, center, s)[0] for each in self.keep_out)])
 
     def goal_box_level(self) -> float:
         """As `box_level`; half a turn away is another equilibrium, which no goal region has in it."""
         clearance = self.bounds - np.abs(self.goal)
         clearance[self.hinges] = np.minimum(clearance[self.hinges], np.pi)
-        return _touching(clearance, self.values[-1])
+        return self._clear(_touching(clearance, self.values[-1]), self.goal, self.values[-1])
 
     def goal_growth(self, rho: float, directions: np.ndarray) -> float:
         """As `growth`, about the goal."""
@@ -367,6 +399,41 @@ def on_grid(matrix: np.ndarray) -> list[list]:
 def _touching(clearance: np.ndarray, s: np.ndarray) -> float:
     """The level of V = x'S x whose ellipsoid touches the first of the half widths [n]."""
     return float(np.min(clearance**2 / np.diag(np.linalg.inv(s))))
+
+
+def _touched(each: HalfSpace | Ellipsoid, center: np.ndarray, s: np.ndarray) -> tuple[float, np.ndarray]:
+    """The level of V = e'S e at which its ellipsoid about `center` touches the set, and the normal [n] of the plane
+    between both, into the set; of an ellipsoid scaled so that it is one over the semi axes, of which it is a mean.
+
+    With W = diag(1 / semi_axis^2), M = W^1/2 S^-1 W^1/2 and a = W^1/2 (c - center), the normal is W^1/2 v with
+    v = (1 + l M)^-1 a and the l for which |v| = 1.
+
+    Raises:
+        Refused: the center is in the set.
+    """
+    inverse = np.linalg.inv(s)
+    if isinstance(each, HalfSpace):
+        normal = np.array(each.normal)
+        left = each.offset - normal @ center
+        check.require(bool(left > 0), "the motion", "enters a set to keep out of")
+        return float(left**2 / (normal @ inverse @ normal)), normal
+    scale = 1 / np.array(each.semi_axes)
+    values, vectors = np.linalg.eigh(scale[:, None] * inverse * scale)
+    apart = vectors.T @ np.where(scale > 0, scale * (np.array(each.center) - center), 0)
+    distance = float(np.linalg.norm(apart))
+    check.require(distance > 1, "the motion", "enters a set to keep out of")
+    values = np.maximum(values, 0)
+
+    def excess(multiplier: float) -> float:
+        return float(np.linalg.norm(apart / (1 + multiplier * values))) - 1
+
+    highest = 2 * (distance - 1) / values[apart != 0].max()
+    while excess(highest) > 0:
+        highest *= 2
+    multiplier = cast(float, brentq(excess, 0, highest, xtol=1e-15 * highest))
+    normal = scale * (vectors @ (apart / (1 + multiplier * values)))
+    step = inverse @ normal * multiplier
+    return float(step @ s @ step), normal
 
 
 def _highest(f: Callable[[np.ndarray], np.ndarray], directions: np.ndarray) -> float:

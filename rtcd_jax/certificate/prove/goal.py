@@ -32,6 +32,7 @@ class GoalRegion(NamedTuple):
     shells: list[Shell]
     margin: float
     late: list
+    sides: list
 
 
 def goal_region(claim: Claim, loop: Loop, exact: bool, rest: float = 0.0, solver: str = SOLVER) -> GoalRegion | None:
@@ -80,4 +81,5 @@ def _at_level(
                 return None
     except Refused:
         return None
-    return GoalRegion(rho, (1 - OUTLET_CLEARANCE) * rho, axes, order, rest, shells[::-1], least, late)
+    outlet, sides = (1 - OUTLET_CLEARANCE) * rho, loop.goal_sides()
+    return GoalRegion(rho, outlet, axes, order, rest, shells[::-1], least, late, sides)
