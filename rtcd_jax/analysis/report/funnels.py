@@ -136,6 +136,8 @@ def _frame(axes: "Axes", plane: Plane) -> None:
         axes.plot([x], [y], marker, mfc=fill, mec=BLACK, ms=9, ls="none", label=name, zorder=4)
     for axis, value in plane.visible_limits:
         (axes.axvline, axes.axhline)[axis](value, color=GRAY, ls="--", lw=1, label="state limit")
+    for polygon in plane.kept_out:
+        axes.fill(*polygon.T, color=GRAY, alpha=0.3, lw=0, label="to keep out of", zorder=0.5)
     horizontal, vertical = itertools.starmap(quantity, plane.states)
     axes.set(xlim=plane.window[:, 0], ylim=plane.window[:, 1], xlabel=horizontal, ylabel=vertical)
 

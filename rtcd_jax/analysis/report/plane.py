@@ -13,6 +13,7 @@ from jaxtyping import Float
 from rtcd_jax.analysis.report.reading import FunnelView
 from rtcd_jax.analysis.report.shapes import outlines, projections
 from rtcd_jax.config.load import Config
+from rtcd_jax.config.schema import KeepOutConfig
 
 MANY = 100
 """Knots from which on lines and marks are finer, and outlines coarser."""
@@ -48,6 +49,8 @@ class Plane:
     shadows: Sequence[Shadow]
     start: Sequence[float]
     goal: Sequence[float]
+    kept_out: Sequence[Float[np.ndarray, "corners 2"]]
+    """Polygons of the sets to keep out of that the plane shows: those of its two states alone, in its window."""
 
     @property
     def visible_limits(self) -> Iterator[tuple[int, float]]:
@@ -79,7 +82,45 @@ def plane_of(
     limits, start, goal = (
         [values[i] for i in pair] for values in (config.task.state_limits, config.start, config.task.goal)
     )
-    return Plane([states[i] for i in pair], limits, window, shadows, start, goal)
+    shown = (_polygon(each, pair, window) for each in config.task.keep_out)
+    kept_out = [polygon for polygon in shown if polygon is not None and len(polygon)]
+    return Plane([states[i] for i in pair], limits, window, shadows, start, goal, kept_out)
+
+
+def _polygon(
+    each: KeepOutConfig, pair: tuple[int, int], window: Float[np.ndarray, "2 2"]
+) -> Float[np.ndarray, "corners 2"] | None:
+    """A set in the window, without corners if it is not there; None if other states bound it too."""
+    others = np.delete(each.normal or 1 / np.array(each.semi_axes), pair)
+    if np.any(others):
+        return None
+    (left, bottom), (right, top) = window
+    if each.normal and each.offset is not None:
+        polygon = np.array([[left, bottom], [right, bottom], [right, top], [left, top]])
+        return _beyond(polygon, np.array(each.normal)[list(pair)], each.offset)
+    center, axes = np.array(each.center)[list(pair)], np.array(each.semi_axes)[list(pair)]
+    if np.all(np.isfinite(axes)):
+        turn = np.linspace(0, 2 * np.pi, 181)
+        polygon = center + axes * np.stack([np.cos(turn), np.sin(turn)], axis=1)
+    else:  # a strip
+        low, high = (
+            np.where(np.isfinite(axes), center + sign * axes, end) for sign, end in zip((-1, 1), window, strict=True)
+        )
+        polygon = np.array([low, [high[0], low[1]], high, [low[0], high[1]]])
+    for axis in (0, 1):
+        for sign, end in ((1, window[0, axis]), (-1, -window[1, axis])):
+            polygon = _beyond(polygon, sign * np.eye(2)[axis], end)
+    return polygon
+
+
+def _beyond(polygon: Float[np.ndarray, "corners 2"], normal: np.ndarray, offset: float) -> np.ndarray:
+    """The part of a convex polygon in which normal . x >= offset (Sutherland and Hodgman, 1974)."""
+    corners = []
+    for a, b in zip(polygon, np.roll(polygon, -1, axis=0), strict=True):
+        before, after = normal @ a - offset, normal @ b - offset
+        corners += [a] if before >= 0 else []
+        corners += [a + before / (before - after) * (b - a)] if before * after < 0 else []
+    return np.array(corners).reshape(-1, 2)
 
 
 def _shadow(funnel: FunnelView, pair: tuple[int, int], points: int | None) -> Shadow:

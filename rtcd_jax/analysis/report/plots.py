@@ -41,7 +41,10 @@ def plane_plot(plane: Plane, unit: str, pair: tuple[int, int], points: int) -> P
         "layout": {
             "xaxis": {"title": {"text": labels[0]}, "range": numbers(plane.window[:, 0])},
             "yaxis": {"title": {"text": labels[1]}, "range": numbers(plane.window[:, 1])},
-            "shapes": [_limit(axis, value) for axis, value in plane.visible_limits],
+            "shapes": [
+                *(_limit(axis, value) for axis, value in plane.visible_limits),
+                *map(_kept_out, plane.kept_out),
+            ],
         },
         "moments": [
             {"source": i, "trace": 2 * count + i, "times": numbers(shadow.funnel.elite.time), "points": points + 1}
@@ -122,6 +125,18 @@ def _limit(axis: int, value: float) -> Plot:
     upright = {"x0": value, "x1": value, "y0": 0, "y1": 1, "xref": "x", "yref": "paper"}
     across = {"y0": value, "y1": value, "x0": 0, "x1": 1, "yref": "y", "xref": "paper"}
     return {"type": "line", "line": {"color": GRAY, "dash": "dash", "width": 1}} | (across if axis else upright)
+
+
+def _kept_out(polygon: np.ndarray) -> Plot:
+    """A set to keep out of, below all else."""
+    corners = "L".join(f"{x:.6g},{y:.6g}" for x, y in polygon)
+    return {
+        "type": "path",
+        "path": f"M{corners}Z",
+        "fillcolor": faint(GRAY, 0.3),
+        "line": {"width": 0},
+        "layer": "below",
+    }
 
 
 def _rounded(values: np.ndarray) -> list[float | None]:

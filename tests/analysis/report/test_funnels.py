@@ -7,6 +7,8 @@ from matplotlib.text import Text
 
 from rtcd_jax.analysis.report.funnels import draw_funnels, draw_over
 from rtcd_jax.analysis.report.page import draw_figures, render
+from rtcd_jax.analysis.report.plane import plane_of
+from rtcd_jax.analysis.report.plots import plane_plot
 from rtcd_jax.analysis.report.reading import compared, read_run
 from rtcd_jax.analysis.report.shapes import outlines, planes, projections
 from tests.analysis.report.runs import candidate, experiment, finished, run_folder
@@ -87,6 +89,39 @@ def test_state_limits_are_drawn_where_the_window_shows_them(tmp_path, figures, l
     draw_funnels(read_run(run_folder(tmp_path / "run", config, best=candidate(config))))
     (axes,) = panels(figures[0])
     assert {(line.get_xdata()[0], line.get_ydata()[0]) for line in lines(axes, "state limit")} == visible
+
+
+KEPT_OUT = {
+    "half space": ({"normal": [1, 1], "offset": 1.2}, lambda x, y: x + y >= 1.2),
+    "disk": (
+        {"center": [0.5, 0.3], "semi_axes": [0.2, 0.1]},
+        lambda x, y: ((x - 0.5) / 0.2) ** 2 + ((y - 0.3) / 0.1) ** 2 <= 1,
+    ),
+    "strip": ({"center": [0.5, 9], "semi_axes": [0.1, float("inf")]}, lambda x, y: abs(x - 0.5) <= 0.1),
+    "far away": ({"center": [0.5, 9], "semi_axes": [0.1, 1]}, lambda x, y: x > 99),
+}
+
+
+@pytest.mark.parametrize("kind", KEPT_OUT)
+def test_sets_to_keep_out_of_are_drawn_as_far_as_the_window_shows_them(tmp_path, figures, kind):
+    """The polygon has those points of the window that are in the set; the page draws the same."""
+    stated, inside = KEPT_OUT[kind]
+    task = {"start": [0, 0], "goal": [1.0, 0.0], "state_limits": [9.0, 9.0], "keep_out": [stated]}
+    run = read_run(run_folder(tmp_path / "run", experiment(task=task), best=candidate(experiment(task=task))))
+    draw_funnels(run)
+    (axes,) = panels(figures[0])
+    drawn = [patch for patch in axes.patches if patch.get_label() == "to keep out of"]
+    x, y = np.random.default_rng(0).uniform(*zip(axes.get_xlim(), axes.get_ylim(), strict=True), (4000, 2)).T
+    expected = inside(x, y)
+    assert len(drawn) == expected.any()
+    if drawn:
+        shown = drawn[0].get_path().contains_points(np.stack([x, y], axis=1))
+        assert np.mean(shown != expected) < 2e-3
+    shapes = plane_plot(plane_of(run.config, run.funnels, (0, 1)), "", (0, 1), 181)["layout"]["shapes"]
+    assert len(shapes) == len(drawn)
+    for shape, patch in zip(shapes, drawn, strict=True):
+        corners = np.array([pair.split(",") for pair in shape["path"][1:-1].split("L")], float)
+        np.testing.assert_allclose(corners, patch.get_path().vertices[: len(corners)], atol=1e-4)
 
 
 def test_volumes_are_drawn_over_time_with_their_guarantee(run, figures):
