@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import yaml
 
+from rtcd_jax.analysis.disturb.scenarios import Loops
 from rtcd_jax.config.load import load, parse, resolved
 from rtcd_jax.elite.closed_loop import outside_limits, runge_kutta, simulate
 from rtcd_jax.elite.elite import Elite
@@ -80,7 +81,10 @@ def test_held_out_motions_never_enter(name, stated):
     elite = Elite.of(arrays_of(problem, evaluation), _record(problem, evaluation))
     assert elite.keep_out == problem.keep_out
     inside = np.array(yaml.safe_load(stated).get("center", 1e3 * np.sign(elite.x_goal + 1)))
-    assert outside_limits(elite, np.stack([inside, elite.x_goal])).tolist() == [True, False]
+    states = np.stack([inside, elite.x_goal])
+    assert outside_limits(elite, states).tolist() == [True, False]
+    loops = Loops.of([elite], [np.zeros((len(elite.u), 2, elite.x_goal.size))])
+    assert jax.jit(Loops.inside)(loops, jnp.asarray(states.T)).tolist() == [False, True]
     knots, x = elite.sample(1500, np.random.default_rng(3))
     shares = np.sqrt([elite.value(k, x[[i]])[0] / elite.rho[k] for i, k in enumerate(knots)])
     x = elite.x[knots] + 0.999 * (x - elite.x[knots]) / shares[:, None]

@@ -96,7 +96,9 @@ class KeepOutConfig(Settings):
 
     @field_validator("offset", mode="plain")
     @classmethod
-    def _finite(cls, offset: Any) -> float:
+    def _finite(cls, offset: Any) -> float | None:
+        if offset is None:  # that of an ellipsoid, among the options of a command
+            return None
         offset = _number(offset)
         if isinstance(offset, bool) or not isinstance(offset, int | float) or not abs(offset) <= LARGEST_OFFSET:
             raise refusal(f"must be >= {-LARGEST_OFFSET:g} and <= {LARGEST_OFFSET:g}")

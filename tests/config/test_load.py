@@ -382,6 +382,10 @@ def test_infinite_limits_are_no_limits():
     assert parse(changed({"task.state_limits": [math.inf, 7]})).task.state_limits == (math.inf, 7)
 
 
+AS_OPTIONS = {"normal": [0, 1], "offset": 2 * math.pi, "center": [], "semi_axes": []}
+"""Of a command, which has one for every key."""
+
+
 def test_sets_to_keep_out_of_are_read_written_and_counted():
     """Arithmetic and .inf, and half spaces beside ellipsoids; without them nothing is written of them."""
     stated = [WALL | {"offset": "2*pi"}, BALL | {"semi_axes": [math.inf, 2]}]
@@ -390,6 +394,7 @@ def test_sets_to_keep_out_of_are_read_written_and_counted():
     assert (half.normal, half.offset) == ((0, 1), 2 * math.pi)
     assert (ellipsoid.center, ellipsoid.semi_axes) == ((0, 5), (math.inf, 2))
     assert parse_yaml(dump(config)) == config
+    assert parse(changed({"task.keep_out": [AS_OPTIONS, {**stated[1], "normal": [], "offset": None}]})) == config
     plain = parse(changed({}))
     assert "keep_out" not in dump(plain)
     assert config_hash(parse(changed({"task.keep_out": []}))) == config_hash(plain) != config_hash(config)
