@@ -12,9 +12,13 @@ error of the measured state, and its age are anyone's choice. All that acts thro
 `Worst` takes, at every Runge-Kutta stage, that end of the interval and that corner of the parameters which raise
 V = e'S(t)e fastest: the signs of dV'/du and of dV'/dp, one reverse sweep for all parameters. This is greedy, and of
 first order in the parameters: the held-out samples are those of `Drawn` robots, which are what epsilon is about.
+
+Where the parameters are constant in time (`uncertainty.center: moving`), V is about the robot's own motion instead of
+x*(t), its numbers are given, and the adversary has all the rest.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from types import MappingProxyType
 from typing import Any, NamedTuple, TypeVar, final
 
 import equinox as eqx
@@ -22,6 +26,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
+from rtcd_jax.numerics.entries import held
 from rtcd_jax.numerics.integrate import split
 from rtcd_jax.plants.base import Plant
 from rtcd_jax.types import Uncertainty
@@ -39,7 +44,7 @@ class Situation(NamedTuple):
     """A state of the closed loop as the controller and V see it; all share the states' trailing axes.
 
     `asked` is u* - K e before it is clipped, `nominal_rate` [n ...] the rate of x*(t), `cost` [n n ...] is S(t); these
-    two are None where nobody asks.
+    two are None where nobody asks. V is about x*(t), or by `shift` [n ...] beside it.
     """
 
     x: tuple[Array, ...]
@@ -49,26 +54,51 @@ class Situation(NamedTuple):
     cost: Any
     nominal_rate: Any
     bounds: Float[Array, "m *#batch"]
+    shift: Any = None
 
-    def late(self, plant: Plant, design: eqx.Module) -> Float[Array, "m *batch"]:
-        """By how much the input rises for each second of the measurement's age."""
-        rate = plant.dynamics(design, jnp.stack(self.x), jnp.clip(self.asked, -self.bounds, self.bounds))
+    def late(self, plant: Plant, design: eqx.Module, scales: "Scales") -> Float[Array, "m *batch"]:
+        """By how much the scaled robot's input rises for each second of the measurement's age."""
+        clipped = jnp.clip(self.asked, -self.bounds, self.bounds)
+        rate = scaled_rate(plant, design, scales, jnp.stack(self.x), clipped)
         moving = rate - self.nominal_rate
         return _times(self.gain, moving)
 
 
+Scales = Mapping[str, Float[Array, "*#batch"]]
+"""Factors of design fields and constants of the robot, by their names."""
+
+
+@final
+class Constant(NamedTuple):
+    """The robot whose numbers are scaled, and nothing else that is uncertain."""
+
+    plant: Plant
+    scales: Scales
+
+    def rate(self, design: eqx.Module, at: Situation) -> tuple[Array, ...]:
+        """The components of x'."""
+        u = jnp.clip(at.asked, -at.bounds, at.bounds)
+        return split(scaled_rate(self.plant, design, self.scales, jnp.stack(at.x), u))
+
+
 @final
 class Worst(NamedTuple):
-    """The adversary: V grows as fast as `uncertainty` allows."""
+    """The adversary: V grows as fast as `uncertainty` allows, for the robot whose numbers are scaled."""
 
     plant: Plant
     uncertainty: Uncertainty
+    scales: Scales = MappingProxyType({})
+
+    def of_robot(self, scales: Scales) -> "Worst":
+        """The adversary of one robot of the box, whose numbers are constant."""
+        others = eqx.tree_at(lambda may: may.parameters, self.uncertainty, {})
+        return self._replace(uncertainty=others, scales=scales)
 
     def rate(self, design: eqx.Module, at: Situation) -> tuple[Array, ...]:
         """The components of x'."""
         may, low, high = self.uncertainty, at.asked, at.asked
         if may.age is not None:
-            late = may.age * at.late(self.plant, design)
+            late = may.age * at.late(self.plant, design, self.scales)
             low, high = low + jnp.minimum(late, 0), high + jnp.maximum(late, 0)
         if may.noise is not None:
             spread = _times(jnp.abs(at.gain), may.noise)
@@ -77,15 +107,20 @@ class Worst(NamedTuple):
         low = jnp.minimum(jnp.clip(low, -weak, weak), jnp.clip(low, -strong, strong)) - may.input
         high = jnp.maximum(jnp.clip(high, -weak, weak), jnp.clip(high, -strong, strong)) + may.input
         x, n = jnp.stack(at.x), len(at.x)
-        slope_of_v = jnp.stack([sum(at.cost[i, j] * at.error[j] for j in range(n)) for i in range(n)])
+        error = at.error if at.shift is None else [e - s for e, s in zip(at.error, at.shift, strict=True)]
+        slope_of_v = jnp.stack([sum(at.cost[i, j] * error[j] for j in range(n)) for i in range(n)])
+
+        def rate(scales, u):
+            return scaled_rate(self.plant, design, {**self.scales, **scales}, x, u)
 
         def power(scales, u):
-            return jnp.sum(slope_of_v * scaled_rate(self.plant, design, scales, x, u))
+            return jnp.sum(slope_of_v * rate(scales, u))
 
         ones = {name: jnp.ones_like(at.x[0]) for name in may.parameters}
         slopes, push = jax.grad(power, argnums=(0, 1))(ones, (low + high) / 2)
         worst = {name: 1 + width * jnp.sign(slopes[name]) for name, width in may.parameters.items()}
-        return split(scaled_rate(self.plant, design, worst, x, jnp.where(push > 0, high, low)))
+        value = sum(slope_of_v[i] * error[i] for i in range(n))
+        return split(rate(*held((worst, jnp.where(push > 0, high, low)), jnp.sign(1 + value))))
 
 
 @final
@@ -141,16 +176,20 @@ class Drawn(NamedTuple):
         """The components of x'."""
         may, x, asked = self.uncertainty, jnp.stack(at.x), at.asked
         if may.age is not None:
-            asked = asked + may.age * self.age * at.late(self.plant, design)
+            asked = asked + may.age * self.age * at.late(self.plant, design, self.scales if may.moving else {})
         if may.noise is not None:
             asked = asked - _times(at.gain, may.noise[:, None] * self.noise)
         bounds = at.bounds * (1 + may.input_limit * self.input_limit)
         u = jnp.clip(asked, -bounds, bounds) + may.input * self.input.reshape(-1, *(1,) * (x.ndim - 2), x.shape[-1])
-        scales = {name: 1 + width * self.parameters[name] for name, width in may.parameters.items()}
-        return split(scaled_rate(self.plant, design, scales, x, u, self.motion))
+        return split(scaled_rate(self.plant, design, self.scales, x, u, self.motion))
+
+    @property
+    def scales(self) -> dict[str, Float[Array, " S"]]:
+        """Of every robot's numbers."""
+        return {name: 1 + width * self.parameters[name] for name, width in self.uncertainty.parameters.items()}
 
 
-Opponent = Worst | Drawn
+Opponent = Worst | Drawn | Constant
 
 Part = TypeVar("Part", bound=eqx.Module)
 
@@ -158,7 +197,7 @@ Part = TypeVar("Part", bound=eqx.Module)
 def scaled_rate(
     plant: Plant,
     design: eqx.Module,
-    scales: dict[str, Float[Array, "*#batch"]],
+    scales: Scales,
     x: Float[Array, "n *batch"],
     u: Float[Array, "m *batch"],
     motion: RobotRate = closed_form_rate,

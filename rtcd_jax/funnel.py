@@ -5,7 +5,8 @@
 (paper, section II-D.2, by simulation), knot by knot backward from rho_N, which comes from long rollouts under the
 goal's LQR. At every knot states are rolled out along rays through the set, on a ladder of radii about the next level's.
 Few random directions come near the worst one, and what each knot misses multiplies along the motion: the worst one is
-climbed to, from where it was at knot k+1. Held-out samples validate the whole (validation.py).
+climbed to, from where it was at knot k+1. Held-out samples validate the whole (validation.py). Where every robot of an
+uncertainty has its own center (centers.py), all this is for each of its corners, and the smallest radius counts.
 """
 
 from functools import partial
@@ -17,7 +18,8 @@ import numpy as np
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from rtcd_jax import rollout
-from rtcd_jax.adversary import Opponent
+from rtcd_jax.adversary import Opponent, Worst
+from rtcd_jax.centers import facing, for_each
 from rtcd_jax.numerics import sampling
 from rtcd_jax.numerics.batched import solve_lower
 from rtcd_jax.numerics.ellipsoid import Ellipsoids
@@ -62,13 +64,15 @@ def estimate_funnel(
     """
     keys = jax.random.split(key, 4)
     rollouts = Rollouts.of(problem, candidate, policy, budget.funnel)
-    sets = rollouts.sets
-    boxes = sets.radii_inside(jnp.asarray(problem.state_limits, sets.centers.dtype))
-    saturated = saturating_radius(problem.input_limits(candidate.design), policy, sets.part(slice(-1, None)))
-    for each in problem.keep_out:
-        boxes = jnp.minimum(boxes, each.radii_clear(sets))
+    goal_set = rollouts.sets.part(slice(-1, None))
+    saturated = saturating_radius(problem.input_limits(candidate.design), policy, goal_set)
+    boxes = for_each(rollouts.robots, lambda robot: _clear_radii(problem, rollouts.about(robot).sets))
+    boxes = boxes if rollouts.robots is None else jnp.min(boxes, 0)
     boxes = jnp.minimum(boxes, REACH * saturated)
     last = goal_level(rollouts, boxes[-1], saturated, keys[0], budget)
+    offsets = rollouts.offsets()
+    if offsets is not None:
+        last = jnp.maximum(jnp.sqrt(last) - offsets[-1], 0) ** 2
 
     levels = knot_levels(rollouts, boxes, last, keys[1], budget)
     levels, samples = validate_intervals(rollouts, levels, keys[2], budget)
@@ -85,7 +89,15 @@ def estimate_funnel(
     )
     uncertain = budget.dynamics.directions.opponent is not None
     borne = jnp.mean(jnp.cumprod(filled[::-1]).astype(levels.dtype)) if uncertain else None
-    return Funnel(policy, levels, samples, status, borne)
+    return Funnel(policy, levels, samples, status, borne, offsets)
+
+
+def _clear_radii(problem: Problem, sets: Ellipsoids) -> Float[Array, " knots"]:
+    """The largest radii with which the sets are inside the limits on the states and clear of what is kept out."""
+    boxes = sets.radii_inside(jnp.asarray(problem.state_limits, sets.centers.dtype))
+    for each in problem.keep_out:
+        boxes = jnp.minimum(boxes, each.radii_clear(sets))
+    return boxes
 
 
 def knot_levels(
@@ -101,33 +113,49 @@ def knot_levels(
     def backward(carry, knot):
         target, shrinkage, adversarial = carry
         index, box, drawn = knot
-        step = _Step.at(rollouts, index)
-
         expected = jnp.minimum(jnp.sqrt(target) * shrinkage, box)
-        alone = partial(step.ends_alone, expected, opponent=budget.dynamics.directions.opponent)
-        adversarial = climb(alone, adversarial, funnel.climbs)
-        directions = jnp.concatenate([drawn, adversarial], 1)
+
+        def climbed(robot, adversarial):
+            opponent = facing(budget.dynamics.directions, robot).opponent
+            alone = partial(_Step.at(rollouts.about(robot), index).ends_alone, expected, opponent=opponent)
+            return climb(alone, adversarial, funnel.climbs)
+
+        adversarial = for_each(rollouts.robots, climbed, adversarial)
 
         def look(radius, window):
             """The smallest radius at which a state leaves the boxes or misses the next set, seen from near `radius`."""
             ladder = jnp.minimum(radius * window ** np.linspace(-1, 1, RADII), box)
-            radii = jnp.broadcast_to(ladder, (directions.shape[1], RADII))
-            reached, peaks = step.ends(radii, directions[..., None], budget.dynamics.directions)
-            # Each for itself: between V and a peak that is near one all the way nothing can be interpolated.
-            shares = jnp.sum(reached**2, 0) / target, peaks**2
-            value, peak = (jnp.where(jnp.isnan(share), jnp.inf, share) for share in shares)
-            crossings = jnp.minimum(_crossings(radii, value), _crossings(radii, peak))
-            return jnp.min(crossings), jnp.maximum(value, peak)[:, -1]
+            radii = jnp.broadcast_to(ladder, (funnel.directions + funnel.climbers, RADII))
+
+            def along(robot, adversarial):
+                directions = jnp.concatenate([drawn, adversarial], 1)[..., None]
+                step = _Step.at(rollouts.about(robot), index)
+                reached, peaks = step.ends(radii, directions, facing(budget.dynamics.directions, robot))
+                # Each for itself: between V and a peak that is near one all the way nothing can be interpolated.
+                shares = jnp.sum(reached**2, 0) / target, peaks**2
+                value, peak = (jnp.where(jnp.isnan(share), jnp.inf, share) for share in shares)
+                crossings = jnp.minimum(_crossings(radii, value), _crossings(radii, peak))
+                return crossings, jnp.maximum(value, peak)[:, -1]
+
+            crossings, bad = for_each(rollouts.robots, along, adversarial)
+            return jnp.min(crossings), bad
+
+        def remembered(robot, adversarial, bad):
+            # The worst of the drawn ones replaces the least bad adversarial one: there may be several maxima.
+            newcomer = _worst(drawn, bad[: funnel.directions], 1)
+            survivors = _worst(adversarial, bad[funnel.directions :], funnel.climbers - 1)
+            return jnp.concatenate([newcomer, survivors], 1)
 
         radius, bad = short_scan(look, jnp.sqrt(target), jnp.asarray(WINDOWS, dtype))
         level = (1 - MARGIN) * radius**2
-        # The worst of the drawn ones replaces the least bad adversarial one: there may be several maxima.
-        newcomer = _worst(drawn, bad[-1, : funnel.directions], 1)
-        survivors = _worst(adversarial, bad[-1, funnel.directions :], funnel.climbers - 1)
-        return (level, jnp.sqrt(level / target), jnp.concatenate([newcomer, survivors], 1)), level
+        adversarial = for_each(rollouts.robots, remembered, adversarial, bad[-1])
+        return (level, jnp.sqrt(level / target), adversarial), level
 
     keys = jax.random.split(key, boxes.shape[0])
-    start = last, jnp.ones((), dtype), sampling.directions(keys[-1], funnel.climbers, n, dtype)
+    climbers = sampling.directions(keys[-1], funnel.climbers, n, dtype)
+    if rollouts.robots is not None:
+        climbers = jnp.broadcast_to(climbers, (rollouts.robots.centers.shape[0], *climbers.shape))
+    start = last, jnp.ones((), dtype), climbers
     drawn = jax.vmap(lambda key: sampling.directions(key, funnel.directions, n, dtype))(keys[:-1])
     knots = jnp.arange(boxes.shape[0] - 1), boxes[:-1], drawn
     _, levels = packed_scan(backward, start, knots, reverse=True)
@@ -193,8 +221,13 @@ def goal_level(
         directions = sampling.directions(key, goal.directions, rollouts.problem.plant.n, box.dtype)
         grid = jnp.broadcast_to(radii, (goal.directions, len(radii)))
         x = goal_set.points(grid[None], directions[:, None, :, None])
-        ends, peaks = rollouts.at_goal(x, dynamics)
-        return grid, jnp.maximum(goal_set.level(ends) / grid**2, peaks**2)[0]
+
+        def growing(robot):
+            ends, peaks = rollouts.at_goal(x, facing(dynamics, robot))
+            return jnp.maximum(goal_set.level(ends) / grid**2, peaks**2)[0]
+
+        bad = for_each(rollouts.robots, growing)
+        return grid, bad if rollouts.robots is None else jnp.max(bad, 0)
 
     def narrow(bracket, turn):
         """Of a ladder of radii over the bracket, the last good one and the one above it, and the crossing between."""
@@ -221,7 +254,7 @@ def goal_level(
     start = (box * SMALLEST, box, box)
     rounds = jax.random.split(key, goal.rounds), np.arange(goal.rounds) == 0
     (_, _, radius), _ = jax.lax.scan(narrow, start, rounds)
-    if dynamics.opponent is not None:
+    if isinstance(dynamics.opponent, Worst):
         # The residual set must be one: from its rim, and from there outward, V falls.
         residual = dynamics.opponent.uncertainty.residual
         ladder = radius * residual ** np.linspace(1, 0, goal.radii)[:-1]

@@ -204,6 +204,7 @@ def _uncertainty(config: Config) -> Uncertainty | None:
         noise=jnp.array(box.noise) if any(box.noise) else None,
         age=jnp.asarray(box.age) if box.age else None,
         residual=jnp.asarray(box.residual),
+        moving=box.center == "moving" and any((box.design | box.plant).values()),
     )
 
 

@@ -70,7 +70,7 @@ def mjx_rate(
 class TrackingData(NamedTuple):
     """Feed-forward and gain schedule: what the controller looks up at both ends and the middle of every Runge-Kutta
     step. Leading axes are (step, stage). For opponents, where the problem has an uncertainty: S(t) and the rates of
-    x*(t).
+    x*(t), and by how much V's center is beside x*(t), where it is.
     """
 
     states: Float[Array, "steps 3 n intervals"]
@@ -78,6 +78,7 @@ class TrackingData(NamedTuple):
     inputs: Float[Array, "m intervals"]
     step: Float[Array, ""]
     others: tuple[Float[Array, "steps 3 n n intervals"], Float[Array, "steps 3 n intervals"]] | None
+    shift: Float[Array, "steps 3 n intervals"] | None = None
 
     def part(self, which: Int[Array | np.ndarray, " chosen"]) -> "TrackingData":
         """The intervals `which`."""
@@ -88,15 +89,8 @@ class TrackingData(NamedTuple):
 def tracking_data(problem: Problem, candidate: Candidate, policy: Policy, steps: int) -> TrackingData:
     """The nominal motion and the gains that `steps` Runge-Kutta steps an interval look up."""
     motion = nominal(problem, candidate, policy.trajectory)
-    grid = np.arange(2 * steps + 1) / (2 * steps)
-    stages = 2 * np.arange(steps)[:, None] + np.arange(3)
-    shares = grid[:, None, None, None]
-
-    def linear(table):
-        """Between the knots, where the stages are."""
-        at_knots = jnp.moveaxis(table, 0, -1)[None]
-        return (at_knots[..., :-1] * (1 - shares) + at_knots[..., 1:] * shares)[stages]
-
+    grid, stages = _grid(steps)
+    linear = partial(linear_in_intervals, steps=steps)
     states, others = motion.at(grid), None
     if problem.uncertainty is not None:
         inputs = jnp.broadcast_to(motion.inputs[..., None], (problem.plant.m, *states.shape[1:]))
@@ -109,6 +103,18 @@ def tracking_data(problem: Problem, candidate: Candidate, policy: Policy, steps:
         step=policy.trajectory.dt / steps,
         others=others,
     )
+
+
+def _grid(steps: int) -> tuple[np.ndarray, np.ndarray]:
+    """Fractions of an interval at which a stage of `steps` Runge-Kutta steps is, and which of them, [step 3]."""
+    return np.arange(2 * steps + 1) / (2 * steps), 2 * np.arange(steps)[:, None] + np.arange(3)
+
+
+def linear_in_intervals(table: Float[Array, "knots *shape"], steps: int) -> Float[Array, "steps 3 *shape intervals"]:
+    """What is given at the knots, between them, where the stages of `steps` Runge-Kutta steps an interval are."""
+    grid, stages = _grid(steps)
+    shares, at_knots = grid.reshape(-1, *(1,) * table.ndim), jnp.moveaxis(table, 0, -1)[None]
+    return (at_knots[..., :-1] * (1 - shares) + at_knots[..., 1:] * shares)[stages]
 
 
 def roll_intervals(
@@ -129,19 +135,21 @@ def roll_intervals(
 
     def step(carry, stage):
         x, peak = carry
-        states, gains, others = stage
+        states, gains, others, shift = stage
 
         def slope(x, place):
             error = [a - align(b) for a, b in zip(x, states[place], strict=True)]
             gain = align(gains[place])
             asked = feedforward - _feedback(gain, error)
             cost, rate = jax.tree.map(lambda table: align(table[place]), others or (None, None))
-            return _rate(dynamics, candidate, Situation(x, error, asked, gain, cost, rate, bounds))
+            beside = None if shift is None else align(shift[place])
+            return _rate(dynamics, candidate, Situation(x, error, asked, gain, cost, rate, bounds, beside))
 
         x = _step(slope, x, tracking.step, dynamics.large)
         return (x, jnp.maximum(peak, _fill(x, problem))), None
 
-    tables = tracking.states, tracking.gains, None if dynamics.opponent is None else tracking.others
+    others = (None, None) if dynamics.opponent is None else (tracking.others, tracking.shift)
+    tables = tracking.states, tracking.gains, *others
     start = split(x)
     (ends, peak), _ = short_scan(step, (start, _fill(start, problem)), tables)
     return jnp.stack(ends), peak

@@ -67,6 +67,7 @@ class Uncertainty(eqx.Module):
     """Half widths of what a funnel must bear: of the robot's numbers and the input limits as shares [-], of a
     disturbance on the motors' axes [input's unit], of the measured state [states' units], the age of the oldest
     measurement that acts [s]; at the goal a motion may stay below the share `residual` of the region. None is no cost.
+    `moving`: the parameters are constant in time, and every robot's funnel is about its own motion.
     """
 
     parameters: dict[str, Float[Array, "*batch"]]
@@ -75,6 +76,7 @@ class Uncertainty(eqx.Module):
     noise: Float[Array, "*batch n"] | None
     age: Float[Array, "*batch"] | None
     residual: Float[Array, "*batch"]
+    moving: bool = eqx.field(static=True, default=False)
 
     def times(self, factor: Float[Array, "*batch"] | float) -> "Uncertainty":
         """The box scaled by a factor; `residual` stays."""
@@ -116,6 +118,7 @@ class Funnel(eqx.Module):
     """B_k = {x : V_k(x) <= levels_k}. `trials` held-out states of B_k were rolled out without a failure.
 
     `borne`, where something is uncertain: the share of the knots, from the last one backward, that have a level.
+    `offsets`, where every robot of the uncertainty has its own center c in the place of x*: the largest sqrt(V_k(c)).
     """
 
     policy: Policy
@@ -123,6 +126,7 @@ class Funnel(eqx.Module):
     trials: Int[Array, "*batch knots"]
     status: Int[Array, "*batch"]
     borne: Float[Array, "*batch"] | None = None
+    offsets: Float[Array, "*batch knots"] | None = None
 
 
 @jax.tree_util.register_pytree_with_keys_class

@@ -18,7 +18,8 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from rtcd_jax import rollout
-from rtcd_jax.adversary import Drawn
+from rtcd_jax.adversary import Constant, Drawn, Worst
+from rtcd_jax.centers import Robots, facing, for_each
 from rtcd_jax.config.schema import FunnelConfig, GoalConfig
 from rtcd_jax.numerics import sampling
 from rtcd_jax.numerics.ellipsoid import Ellipsoids
@@ -58,7 +59,10 @@ class SamplingBudget:
 
 
 class Rollouts(NamedTuple):
-    """What rollouts of a policy need, over one interval or from any knot to the goal."""
+    """What rollouts of a policy need, over one interval or from any knot to the goal.
+
+    `robots` are those whose own motions are the centers of the sets, where not all have x* as theirs.
+    """
 
     problem: Problem
     candidate: Candidate
@@ -67,13 +71,30 @@ class Rollouts(NamedTuple):
     tracking: rollout.TrackingData
     stiffness: rollout.Stiffness
     goal: GoalConfig
+    robots: Robots | None = None
 
     @classmethod
     def of(cls, problem: Problem, candidate: Candidate, policy: Policy, funnel: FunnelConfig) -> "Rollouts":
         sets = Ellipsoids.about(policy.trajectory.xs.T, jnp.moveaxis(policy.values, 0, -1))
         tracking = rollout.tracking_data(problem, candidate, policy, funnel.steps)
         stiffness = rollout.stiffness(problem, candidate, policy, funnel)
-        return cls(problem, candidate, policy, sets, tracking, stiffness, funnel.goal)
+        robots, uncertainty = None, problem.uncertainty
+        if uncertainty is not None and uncertainty.moving:
+            robots = Robots.of(problem, candidate, tracking, sets.centers, uncertainty)
+        return cls(problem, candidate, policy, sets, tracking, stiffness, funnel.goal, robots)
+
+    def about(self, robot: Robots | None) -> "Rollouts":
+        """With one robot's own motion as the center of the sets."""
+        if robot is None:
+            return self
+        tracking = self.tracking._replace(shift=robot.shifts)
+        return self._replace(sets=self.sets._replace(centers=robot.centers), tracking=tracking)
+
+    def offsets(self) -> Float[Array, " knots"] | None:
+        """The largest sqrt(V_k) of a robot's own motion."""
+        if self.robots is None:
+            return None
+        return jnp.sqrt(jnp.max(jax.vmap(self.sets.level)(self.robots.centers), 0))
 
     @property
     def intervals(self) -> int:
@@ -109,13 +130,16 @@ class Rollouts(NamedTuple):
         ends, peaks = self.at_goal(x, dynamics)
         before, after = self.level(x, self.intervals), self.level(ends, self.intervals)
         closer = after < before
-        if dynamics.opponent is not None:
+        if isinstance(dynamics.opponent, Worst | Drawn):
             closer |= after <= dynamics.opponent.uncertainty.residual**2 * last
         return ends, (peaks <= 1) & closer
 
-    def level(self, x: Float[Array, "n S"], k: Int[Array, ""] | int) -> Float[Array, " S"]:
-        """V_k of states at one knot."""
-        return self.sets.part(k + np.arange(1)).level(x[:, None])[0]
+    def level(
+        self, x: Float[Array, "n S"], k: Int[Array, ""] | int, centers: Float[Array, "n S"] | None = None
+    ) -> Float[Array, " S"]:
+        """V_k of states at one knot, each about its own center where that is not x*_k."""
+        sets = self.sets.part(k + np.arange(1))
+        return (sets.level(x[:, None]) if centers is None else sets.value_of_error((x - centers)[:, None]))[0]
 
     def uniform(
         self, levels: Float[Array, " knots"], born: Int[Array | np.ndarray, " S"], key: PRNGKeyArray
@@ -123,6 +147,45 @@ class Rollouts(NamedTuple):
         """States, each uniform in the ellipsoid of the knot in which it is born."""
         y = sampling.ball(key, born.shape, self.sets.centers.shape[0], levels.dtype)
         return self.sets.part(born).points(jnp.sqrt(levels)[born], y)
+
+
+class OwnMotions(NamedTuple):
+    """The centers [n S] of drawn robots' funnels at one knot, for states that are `born` at some knot with an `offset`
+    from their robot's center; all None where x* is the center of all.
+    """
+
+    centers: Float[Array, "n S"] | None
+    offset: Float[Array, "n S"] | None
+    born: Int[Array | np.ndarray, " S"] | None
+    robots: Constant | None
+
+    @classmethod
+    def of(
+        cls, rollouts: Rollouts, drawn: Drawn | None, x: Float[Array, "n S"], born: Int[Array | np.ndarray, " S"]
+    ) -> "OwnMotions":
+        """At x*(0), for states that were drawn about x*."""
+        if drawn is None or not drawn.uncertainty.moving:
+            return cls(None, None, None, None)
+        at_knots = rollouts.sets.centers
+        start = jnp.broadcast_to(at_knots[:, :1], x.shape)
+        return cls(start, x - at_knots[:, born], jnp.asarray(born), Constant(drawn.plant, drawn.scales))
+
+    def first(self, knot: Int[Array | np.ndarray, ""]) -> Int[Array | np.ndarray, ""] | int:
+        """The knot to begin with, if the first state is born at `knot`."""
+        return knot if self.centers is None else 0
+
+    def start(self, x: Float[Array, "n S"], k: Int[Array, ""] | int) -> Float[Array, "n S"]:
+        """The states at knot k, where those that are born there are about their own centers."""
+        if self.centers is None or self.offset is None:
+            return x
+        return jnp.where(self.born == k, self.centers + self.offset, x)
+
+    def onward(self, rollouts: Rollouts, k: Int[Array, ""]) -> "OwnMotions":
+        """At the knot behind k."""
+        if self.centers is None:
+            return self
+        alone = rollout.closed_form(rollouts.problem.plant, self.robots)
+        return self._replace(centers=rollouts.interval(self.centers, k, alone)[0])
 
 
 class _Validated(NamedTuple):
@@ -139,20 +202,29 @@ def validate_intervals(
 
     The last level keeps zero samples: no interval starts there.
     """
-    starts, nexts = rollouts.sets.part(slice(0, -1)), rollouts.sets.part(slice(1, None))
     count = budget.funnel.trials
 
     def one_round(levels, key):
         inner, share = jax.random.split(key)
-        x = _uniform(starts, levels[:-1], inner, count)
-        ends, peaks = rollouts.roll(rollouts.tracking, x, budget.dynamics.held_out)
-        if budget.dynamics.share is not None:
-            which = _share(share, x.shape[1], budget.funnel)
-            chosen = x[:, which.knots, : which.states]
-            new_ends, new_peaks = rollouts.roll(rollouts.tracking.part(which.knots), chosen, budget.dynamics.share)
-            ends = ends.at[:, which.knots, : which.states].set(new_ends)
-            peaks = peaks.at[which.knots, : which.states].set(new_peaks)
-        shrunk, failures = _shrink(levels, starts.level(x), nexts.level(ends), peaks <= 1)
+
+        def rolled(robot):
+            """Levels of the samples at the intervals' starts and ends, and their peaks."""
+            own = rollouts.about(robot)
+            starts, nexts = own.sets.part(slice(0, -1)), own.sets.part(slice(1, None))
+            x = _uniform(starts, levels[:-1], inner, count)
+            ends, peaks = own.roll(own.tracking, x, facing(budget.dynamics.held_out, robot))
+            if budget.dynamics.share is not None:
+                which = _share(share, x.shape[1], budget.funnel)
+                chosen = x[:, which.knots, : which.states]
+                new_ends, new_peaks = own.roll(own.tracking.part(which.knots), chosen, budget.dynamics.share)
+                ends = ends.at[:, which.knots, : which.states].set(new_ends)
+                peaks = peaks.at[which.knots, : which.states].set(new_peaks)
+            return starts.level(x), nexts.level(ends), peaks <= 1
+
+        samples = for_each(rollouts.robots, rolled)
+        if rollouts.robots is not None:
+            samples = [jnp.concatenate(list(of_robots), 1) for of_robots in samples]
+        shrunk, failures = _shrink(levels, *samples)
         return shrunk, jnp.append(failures, 0)
 
     done = _repeat(one_round, levels, key, budget.rounds)
@@ -171,6 +243,8 @@ def validate_paths(
 
     In rounds of `samples_per_knot` (a number or a tracer; the budget's), on which epsilon rests. Before each of them
     come cheap ones of `budget.funnel.trials` states a knot, until one is clean.
+
+    Where every robot has its own center, it is followed beside the state of its funnel from x*(0) on.
 
     A state fails if it leaves the funnel at a later knot, leaves the boxes, or does not come closer to the goal (by its
     V) over the horizon after t_N. Wherever a path leaves the funnel, the level from which it left is the one to shrink:
@@ -195,19 +269,23 @@ def validate_paths(
         """Levels below those of states of the knots `born` that failed, and which of these states did."""
         drawn = None if uncertainty is None else Drawn.of(plant, uncertainty, jax.random.fold_in(key, 1), batch)
         x = rollouts.uniform(levels, born, key)
+        own = OwnMotions.of(rollouts, drawn, x, born)
 
         def forward(k, state):
-            x, values, inside = state
+            x, own, values, inside = state
             started = born <= k
+            x = own.start(x, k)
             opponent = drawn if drawn is None else drawn.at_knot(k)
             ends, within = rollouts.interval(x, k, rollout.closed_form(plant, opponent))
-            values = values.at[k].set(rollouts.level(x, k))
-            return jnp.where(started, ends, x), values, inside.at[k].set(within)
+            values = values.at[k].set(rollouts.level(x, k, own.centers))
+            return jnp.where(started, ends, x), own.onward(rollouts, k), values, inside.at[k].set(within)
 
         blank = jnp.zeros((knots - 1, batch), x.dtype), jnp.zeros((knots - 1, batch), bool)
-        x, values, inside = jax.lax.fori_loop(jnp.min(born), knots - 1, forward, (x, *blank))
+        first = own.first(jnp.min(born))
+        x, own, values, inside = jax.lax.fori_loop(first, knots - 1, forward, (x, own, *blank))
+        x = own.start(x, knots - 1)
         _, arrives = rollouts.arrive(x, rollout.closed_form(plant, drawn), levels[-1])
-        last = rollouts.level(x, knots - 1)
+        last = rollouts.level(x, knots - 1, own.centers)
         final = _below(levels[-1], last, ~arrives)
 
         def backward(carry, knot):
@@ -297,14 +375,20 @@ class PhysicsComparison(eqx.Module):
 
 
 class _Pair(NamedTuple):
-    """States of both physics side by side, and the largest difference so far with where it was."""
+    """States of both physics side by side, where they were born, and the largest difference so far with its place."""
 
+    starts: Float[Array, "n S"]
     closed_form: Float[Array, "n S"]
     mjx: Float[Array, "n S"]
     failed: Bool[Array, " S"]
     difference: Float[Array, " S"]
     place: Int[Array, " S"]
     ends: Float[Array, "2 n S"]
+
+    def starting(self, own: OwnMotions, k: Int[Array, ""] | int) -> "_Pair":
+        """With the states that are born at knot k."""
+        starts, closed_form, mjx = (own.start(x, k) for x in (self.starts, self.closed_form, self.mjx))
+        return self._replace(starts=starts, closed_form=closed_form, mjx=mjx)
 
     def seen(self, place: Int[Array, ""] | int, difference: Float[Array, " S"]) -> "_Pair":
         """With the states of now where they differ more than ever; a NaN differs without limit."""
@@ -345,28 +429,32 @@ def compare_physics(
         if uncertainty is not None:
             robots = Drawn.of(plant, uncertainty, jax.random.fold_in(key_of_block, 1), born.shape[0])
 
-        def forward(k, pair: _Pair) -> _Pair:
-            started = born <= k
+        def forward(k, state: tuple[_Pair, OwnMotions]) -> tuple[_Pair, OwnMotions]:
+            pair, own = state
+            pair, own, started = pair.starting(own, k), own.onward(rollouts, k), born <= k
             drawn = robots if robots is None else robots.at_knot(k)
             ends, _ = rollouts.interval(pair.closed_form, k, rollout.closed_form(plant, drawn))
             other, inside = rollouts.interval(pair.mjx, k, mjx(plant, drawn))
-            left = started & ~(inside & (rollouts.level(other, k + 1) <= levels[k + 1]))
+            left = started & ~(inside & (rollouts.level(other, k + 1, own.centers) <= levels[k + 1]))
             pair = pair._replace(
                 closed_form=jnp.where(started, ends, pair.closed_form),
                 mjx=jnp.where(started, other, pair.mjx),
                 failed=pair.failed | left,
             )
             apart = difference(pair.closed_form, pair.mjx, k + 1)
-            return pair.seen(k + 1, jnp.where(started, apart, 0))
+            return pair.seen(k + 1, jnp.where(started, apart, 0)), own
 
         nothing = jnp.zeros(born.shape, bool), jnp.full(born.shape, -1.0), born, jnp.stack([x, x])
-        pair = jax.lax.fori_loop(born[0], knots - 1, forward, _Pair(x, x, *nothing))
+        own = OwnMotions.of(rollouts, robots, x, born)
+        start = _Pair(x, x, x, *nothing), own
+        pair, own = jax.lax.fori_loop(own.first(born[0]), knots - 1, forward, start)
+        pair = pair.starting(own, knots - 1)
         ends, _ = rollouts.arrive(pair.closed_form, rollout.closed_form(plant, robots), levels[-1])
         other, arrives = rollouts.arrive(pair.mjx, mjx(plant, robots), levels[-1])
         pair = pair._replace(closed_form=ends, mjx=other, failed=pair.failed | ~arrives)
-        return None, (pair.seen(knots, difference(ends, other, knots - 1)), x)
+        return None, pair.seen(knots, difference(ends, other, knots - 1))
 
-    _, (pairs, starts) = jax.lax.scan(block, None, (np.arange(blocks), born))
+    _, pairs = jax.lax.scan(block, None, (np.arange(blocks), born))
     flat = jnp.argmax(pairs.difference)
     where = flat // born.shape[1], flat % born.shape[1]
     closed, other = pairs.ends[where[0], :, :, where[1]]
@@ -378,7 +466,7 @@ def compare_physics(
         difference=pairs.difference[where],
         knot=jnp.asarray(born)[where],
         time=jnp.where(place == knots, (knots - 1) * dt + rollouts.goal.horizon, place * dt),
-        start=starts[where[0], :, where[1]],
+        start=pairs.starts[where[0], :, where[1]],
         closed_form=closed,
         mjx=other,
     )

@@ -2,6 +2,8 @@
 
 import dataclasses
 import itertools
+import subprocess
+import sys
 from functools import cache, partial
 from typing import ClassVar, final
 
@@ -196,6 +198,13 @@ def estimator():
         return estimate_funnel(robust, one.candidate, one.funnel.policy, pipeline.GENERATION, budget)
 
     return estimate, one
+
+
+@pytest.mark.thorough
+def test_two_uncertain_numbers_of_a_cartpole_compile():
+    """What the adversary chooses is computed once: written out wherever it is used, it took more than 20 GiB."""
+    done = subprocess.run([sys.executable, "-m", "tests.compiling"], capture_output=True, check=False)
+    assert done.returncode == 0, done.stderr.decode()[-500:]
 
 
 @pytest.mark.thorough

@@ -225,9 +225,11 @@ def disturb(options: DisturbOptions, console: Console) -> Exit:
 class ToleranceOptions(Options):
     """Find the largest factor of every uncertainty, and of all at once, under which an elite's policy has a funnel.
 
-    The box is the run's `uncertainty`, or that of a YAML file. Results: a table, and tolerance/NNN.json, .csv, .png and
-    .pdf in the run folder; all factors are sampled, within 1 %. With --prove the whole box is proved, too, within
-    5 %, by some ten certificates, of which tolerance/certificates/NNN.json is the largest that holds.
+    The box is the run's `uncertainty`, or that of a YAML file. Where numbers of the robot are uncertain, the whole box
+    is tried a second time with numbers that are constant, each robot about its own motion. Results: a table, and
+    tolerance/NNN.json, .csv, .png and .pdf in the run folder; all factors are sampled, within 1 %. With --prove the
+    whole box is proved, too, within 5 %, by some ten certificates, of which tolerance/certificates/NNN.json is the
+    largest that holds.
 
     Example: rtcd tolerance checkpoints/pendulum_robust --uncertainty lab.yaml
     Example: rtcd tolerance checkpoints/pendulum_robust --prove

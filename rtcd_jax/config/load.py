@@ -56,7 +56,11 @@ weights:
 """The shortest complete YAML: the paper's pendulum with the default settings."""
 
 SMALLEST_DESIGN, SMALLEST_WEIGHT = 1e-6, 1e-9
+MOST_CORNERS = 5
+"""Numbers of a box whose corners are followed one by one."""
+
 LATER_KEYS = (
+    ("uncertainty", "center"),
     ("uncertainty",),
     ("search", "at_least"),
     ("search", "refine"),
@@ -309,6 +313,10 @@ def _uncertain(plant: PlantConfig, uncertainty: UncertaintyConfig, funnel: Funne
             if name not in known:
                 path = "uncertainty", section, name
                 yield Problem(path, f"must be a {section} parameter of {plant.name}; {closest(name, known)}")
+    numbers = [name for name, width in (uncertainty.design | uncertainty.plant).items() if width]
+    if uncertainty.center == "moving" and len(numbers) > MOST_CORNERS:
+        text = f"follows all corners of the box: at most {MOST_CORNERS} numbers may be uncertain, {len(numbers)} are"
+        yield Problem(("uncertainty", "center"), text, uncertainty.center)
     if uncertainty.noise:
         yield from _size(("uncertainty", "noise"), uncertainty.noise, plant.states)
     if not uncertainty.empty and funnel.rollouts != "closed_form":

@@ -313,6 +313,12 @@ class UncertaintyConfig(Settings):
         default=0.5, description="share of the goal's region, in radius, below which a motion may stay [-]"
     )
 
+    center: Literal["common", "moving"] = Field(
+        default="common",
+        description="common: the numbers of `design` and `plant` may vary in time, all robots have one funnel; moving: "
+        "they are constant, and every robot's funnel is about its own motion",
+    )
+
     @property
     def empty(self) -> bool:
         """Whether nothing is uncertain."""
@@ -333,6 +339,8 @@ class UncertaintyConfig(Settings):
             return "one exact model"
         shares = self.design | self.plant | {"input limit": self.input_limit}
         parts = [f"{name} ± {share:.3g} of itself" for name, share in shares.items() if share]
+        if self.center == "moving" and any((self.design | self.plant).values()):
+            parts.append("constant in time, each robot about its own motion")
         unit = next(iter(plant.input_units.values()))
         parts += [f"|w(t)| <= {self.input:g} {unit} on the motors' axes"] if self.input else []
         measured = zip(plant.states.items(), self.noise, strict=False)

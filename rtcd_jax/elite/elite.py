@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, final
@@ -27,6 +27,12 @@ class NoFunnel(UserError):
         self.status = status
 
 
+OPTIONAL = ("pushes", "S_rates", "center_offsets")
+"""Arrays that not every elite has."""
+
+LEAST_LEFT = 1e-6
+"""Share of a radius that stands for nothing, where the robots' own motions are farther apart than their ellipsoids."""
+
 LARGEST = 1e12
 """Of a robot's and a controller's numbers, in SI units."""
 
@@ -40,7 +46,8 @@ class Elite:
     probability of at most `epsilon`. `guarantee` says on what ground; a claimed funnel promises that no state fails.
     `volumes` are the funnel's, by name, `pushes` the largest impulse on each input at each knot that leaves x* + B J in
     the funnel (None in files that lack it), `S_rates` are S' at both ends of every interval where S is no Riccati
-    equation's, and `record` is all of `NNN.json`.
+    equation's, `center_offsets` the largest sqrt(V_k) of the robots' own motions where the ellipsoids are about these,
+    and `record` is all of `NNN.json`.
 
     Raises:
         UserError: shapes that do not belong together, or no funnel: a level or an S that is not positive.
@@ -68,6 +75,7 @@ class Elite:
     pushes: Float[np.ndarray, "knots m"] | None = None
     record: Mapping[str, Any] = field(default_factory=dict)
     S_rates: Float[np.ndarray, "intervals 2 n n"] | None = None
+    center_offsets: Float[np.ndarray, " knots"] | None = None
 
     def __post_init__(self):
         knots, n, m = self.time.size, self.x_goal.size, self.u_max.size
@@ -80,6 +88,8 @@ class Elite:
             shapes["pushes"] = (knots, m)
         if self.S_rates is not None:
             shapes["S_rates"] = knots - 1, 2, n, n
+        if self.center_offsets is not None:
+            shapes["center_offsets"] = (knots,)
         wrong = [f"{name} {getattr(self, name).shape}" for name in shapes if getattr(self, name).shape != shapes[name]]
         if wrong:
             raise UserError(
@@ -119,7 +129,7 @@ class Elite:
         }
         fields: dict[str, Any] = {**named, **numbers, "volumes": volumes, "record": record}
         stored = {"guarantee": "rung"}  # the field's key in NNN.json
-        needed = [name for name in cls.__dataclass_fields__ if name not in ("pushes", "S_rates")]
+        needed = [name for name in cls.__dataclass_fields__ if name not in OPTIONAL]
         missing = [stored.get(name, name) for name in needed if fields.get(name) is None]
         if missing:
             raise UserError(f"the elite lacks {', '.join(missing)}")
@@ -170,6 +180,13 @@ class Elite:
     def policy(self) -> Mapping[str, float]:
         """The policy's options by name; what is absent is as in the configuration's defaults."""
         return self.record.get("policy", {})
+
+    def of_all_robots(self) -> "Elite":
+        """The same with the ellipsoids about x* that lie in the funnel of every robot of the uncertainty."""
+        if self.center_offsets is None:
+            return self
+        left = 1 - self.center_offsets / np.sqrt(self.rho)
+        return replace(self, rho=self.rho * np.maximum(left, LEAST_LEFT) ** 2)
 
     def value(self, k: int, x: Float[np.ndarray, "states n"]) -> Float[np.ndarray, " states"]:
         """V_k(x) = (x - x_k)' S_k (x - x_k)."""

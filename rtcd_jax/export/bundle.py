@@ -174,7 +174,7 @@ def read_bundle(
     Raises:
         UserError: it is not there, cannot be read or has no funnel; a label that is no name in Python and C.
     """
-    elite = Elite.read(folder, name)
+    elite = Elite.read(folder, name).of_all_robots()
     label = _label(label or f"{elite.plant}_{name}")
     certificate = standing(folder, name, lambda done, of: show(done, of, "checking the certificate"))
     proof = ProvedFunnel.read(certificate_path(folder, name)) if certificate.proved else None

@@ -43,6 +43,7 @@ def arrays_of(problem: Problem, evaluation: Evaluation) -> dict[str, np.ndarray]
         "u_max": np.asarray(problem.input_limits(host.candidate.design)),
         "volumes_per_knot": volumes.per_knot,
         "pushes": _pushes(problem, evaluation)[0],
+        **({} if host.funnel.offsets is None else {"center_offsets": host.funnel.offsets}),
         **{f"volumes_{name}": volumes[name] for name in VOLUMES},
         "genome": host.genome,
     }
@@ -63,7 +64,8 @@ def evaluation_of(problem: Problem, arrays: Mapping[str, Any], record: Mapping[s
     policy = policy_of(arrays, record)
     genome, levels, trials = (jnp.asarray(arrays[name]) for name in ("genome", "rho", "trials"))
     borne = None if problem.uncertainty is None else jnp.ones(())
-    funnel, candidate = Funnel(policy, levels, trials, policy.status, borne), decode(problem, genome)
+    offsets = jnp.asarray(arrays["center_offsets"]) if "center_offsets" in arrays else None
+    funnel, candidate = Funnel(policy, levels, trials, policy.status, borne, offsets), decode(problem, genome)
     volumes = funnel_volume(funnel, input_jumps(problem, candidate, policy.trajectory))
     return jax.device_get(Evaluation(genome, candidate, funnel, volumes, policy.status))
 

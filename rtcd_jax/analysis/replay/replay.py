@@ -108,7 +108,7 @@ def replay_run(
         UserError: no run folder, no such elite, a file that is no measured motion, or a folder that cannot be written.
     """
     config = read_config(folder)
-    name, elite = elite_name(which), Elite.read(folder, which)
+    name, elite = elite_name(which), Elite.read(folder, which).of_all_robots()
     states, funnel = config.plant.states, FunnelInterpolant.of(elite)
     measured = read_measured(file, states, columns, start)
     _check_time(file, measured, float(elite.time[-1]))

@@ -1,7 +1,7 @@
 """A box of uncertainty and the single uncertainties that it is made of."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import inf
 from pathlib import Path
 from typing import Any, final
@@ -9,7 +9,7 @@ from typing import Any, final
 import jax
 import jax.numpy as jnp
 
-from rtcd_jax.config.load import Config, parse, read_uncertainty, resolved
+from rtcd_jax.config.load import MOST_CORNERS, Config, parse, read_uncertainty, resolved
 from rtcd_jax.problem import Problem
 from rtcd_jax.system.errors import UserError
 from rtcd_jax.types import Uncertainty
@@ -17,6 +17,7 @@ from rtcd_jax.types import Uncertainty
 ALL_OF_ITSELF = 0.999
 """Largest relative half width: a mass is positive."""
 WHOLE = "whole box"
+OWN = "whole box about own motions"
 
 
 @final
@@ -60,6 +61,15 @@ def sides(problem: Problem) -> list[Side]:
     singles = [Side(*each) for each in _singles(problem, whole, nothing) if each[2]]
     most = min((side.most for side in singles), default=inf)
     return [*singles, Side(WHOLE, "", None, whole, most)]
+
+
+def about_own_motions(problem: Problem, whole: Side) -> Side | None:
+    """The whole box of constant numbers, each robot about its own motion; None where that is nothing else."""
+    box = problem.config.uncertainty
+    numbers = [name for name, width in (box.design | box.plant).items() if width]
+    if whole.box.moving or not 0 < len(numbers) <= MOST_CORNERS:
+        return None
+    return replace(whole, name=OWN, box=replace(whole.box, moving=True))
 
 
 def stacked(boxes: list[Side], factors: Any) -> Uncertainty:

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from rtcd_jax.analysis.tolerance.box import Side, sides, stacked, with_box
+from rtcd_jax.analysis.tolerance.box import Side, about_own_motions, sides, stacked, with_box
 from rtcd_jax.analysis.tolerance.factors import MOST, PRECISE, is_open, largest_factors
 from rtcd_jax.analysis.tolerance.figures import draw_tolerance
 from rtcd_jax.analysis.tolerance.proved import proved_factor
@@ -35,8 +35,9 @@ FOLDER = "tolerance"
 def tolerance_run(folder: Path, which: int | str, file: Path | None, console: Console, prove: bool = False) -> None:
     """Stores `tolerance/NNN.json`, `.csv` and the figure of one elite, and shows the table.
 
-    The box is the run's, or that of the YAML `file`. Where it is to `prove`, the whole box has a second row, and what
-    was proved lies in `tolerance/certificates`.
+    The box is the run's, or that of the YAML `file`. The whole box has a second row where the robot's numbers may be
+    constant, each robot about its own motion, and one more where it is to `prove`: what was proved lies in
+    `tolerance/certificates`.
 
     Raises:
         UserError: no run folder, no such elite or one without a funnel, a box that is wrong or empty, or a folder that
@@ -57,8 +58,13 @@ def tolerance_run(folder: Path, which: int | str, file: Path | None, console: Co
     numbers = {name: np.asarray(values) for name, values in volumes.items()}
     place, name, box = folder / FOLDER, elite_name(which), problem.config.uncertainty
     rows = _rows(boxes, factors, numbers)
+    if (own := about_own_motions(problem, boxes[-1])) is not None:
+        console.message("the whole box once more, each robot about its own motion")
+        factor = largest_factors(lambda factors: np.asarray(evaluate(stacked([own], factors))[0]), np.array([own.most]))
+        _, there = evaluate(stacked([own], factor))
+        rows += _rows([own], factor, {name: np.asarray(values) for name, values in there.items()})
     if prove:
-        rows.append(rows[-1] | proved_factor(folder, FOLDER, name, box, boxes[-1].most, console))
+        rows.append(rows[len(boxes) - 1] | proved_factor(folder, FOLDER, name, box, boxes[-1].most, console))
     record = {"elite": name, "config_hash": elite.record.get("config_hash"), "rung": "sampled",
               "uncertainty": box.model_dump(), "precision": PRECISE - 1, "rows": rows}  # fmt: skip
     replace_json(place / f"{name}.json", record)
