@@ -1,4 +1,4 @@
-"""Compiles what climbs to the worst directions of a cart-pole whose mass and length are uncertain, in 10 GiB at most."""
+"""Compiles the climb to the worst directions of a cart-pole whose mass and length are uncertain, in at most 10 GiB."""
 
 import resource
 

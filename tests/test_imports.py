@@ -21,6 +21,7 @@ LAYERS = (
         "trajectory",
         "policy",
         "adversary",
+        "centers",
         "rollout",
         "validation",
         "funnel",
