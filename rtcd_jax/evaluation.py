@@ -14,6 +14,7 @@ from jaxtyping import Array, Float, Int, PRNGKeyArray, PyTree
 
 from rtcd_jax import rollout
 from rtcd_jax.adversary import Worst
+from rtcd_jax.dirtrel import dirtrel
 from rtcd_jax.funnel import estimate_funnel
 from rtcd_jax.genome import decode
 from rtcd_jax.numerics.interior_point import CACHE, VECTOR
@@ -22,9 +23,9 @@ from rtcd_jax.policy import input_jumps, stabilize
 from rtcd_jax.problem import Problem
 from rtcd_jax.system.devices import path_batch
 from rtcd_jax.trajectory import plan
-from rtcd_jax.types import Candidate, Evaluation, Policy, Status, TaskEvaluations, Volumes
+from rtcd_jax.types import Candidate, Evaluation, Funnel, Policy, Status, TaskEvaluations, Volumes
 from rtcd_jax.validation import Dynamics, PhysicsComparison, Rollouts, SamplingBudget, compare_physics
-from rtcd_jax.volume import OVER_TASKS, funnel_volume
+from rtcd_jax.volume import DIRTREL, OVER_TASKS, funnel_volume
 
 TEMPORARIES = 16
 """Memory of a candidate on a GPU over that of its held-out samples, as counted by launch/bench/gpu_budget.py."""
@@ -196,5 +197,14 @@ def _with_funnel(
 ) -> Evaluation:
     problem = problem.of(candidate)
     funnel = estimate_funnel(problem, candidate, policy, key, budget(problem), samples_per_knot)
-    volumes = funnel_volume(funnel, input_jumps(problem, candidate, policy.trajectory))
+    volumes = volumes_of(problem, candidate, funnel)
     return Evaluation(genome, candidate, funnel, volumes, funnel.status)
+
+
+def volumes_of(problem: Problem, candidate: Candidate, funnel: Funnel) -> Volumes:
+    """All volumes of a candidate's funnel, and what else is searched for."""
+    volumes = funnel_volume(funnel, input_jumps(problem, candidate, funnel.policy.trajectory))
+    if problem.config.search.objective != DIRTREL:
+        return volumes
+    found = jnp.where(funnel.status == Status.OK, dirtrel(problem, candidate, funnel.policy), 0)
+    return Volumes(volumes.per_knot, {**volumes.named, DIRTREL: found})

@@ -41,6 +41,13 @@ class Volume(NamedTuple):
     push: bool = False
 
 
+class Other(NamedTuple):
+    """What a search may maximize that is no volume of the funnel; `unit` is its own."""
+
+    meaning: str
+    unit: str
+
+
 GOAL = "goal"
 """Needs no motion: a search for it is about the funnels of robots at rest."""
 
@@ -60,6 +67,12 @@ VOLUMES = {
     GOAL: Volume("v_N of the goal's region", lambda at: at.v[-1]),
 }
 
+
+DIRTREL = "dirtrel"
+OTHERS = {DIRTREL: Other("1 / l_w of DIRTREL, for comparison: among candidates with a funnel", "1/cost")}
+"""Objectives that only those runs know which search for them."""
+
+OBJECTIVES = (*VOLUMES, *OTHERS)
 
 LATER = ("push", GOAL)
 """Those that older runs lack."""

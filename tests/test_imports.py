@@ -22,6 +22,7 @@ LAYERS = (
         "policy",
         "adversary",
         "centers",
+        "dirtrel",
         "rollout",
         "validation",
         "funnel",

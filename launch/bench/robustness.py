@@ -129,7 +129,8 @@ def borne(run: Path, name: str) -> dict[str, float | None]:
         return read_json(file, "remove it") if file.is_file() else {}
 
     elite, who = Elite.read(run, name), "initial" if name == "initial" else "best"
-    whole = stored("tolerance", f"{name}.json").get("rows", [{}])[-1]
+    rows = stored("tolerance", f"{name}.json").get("rows", [])
+    whole = next((row for row in rows if row["name"] == "whole box" and row["guarantee"] == "sampled"), {})
     push, robust = (stored("disturbance", f"{each}.json").get("summary", {}) for each in ("impulse", "robustness"))
     push, robust = push.get(who, {}), robust.get(who, {})
     numbers = [elite.volumes.get(each) for each in ("sum", "integral", "inlet", "geometric_mean", "push")]

@@ -25,7 +25,7 @@ from rtcd_jax.config.plants import Number as Arithmetic
 from rtcd_jax.config.plants import PlantConfig
 from rtcd_jax.config.settings import Settings, invalid, refusal
 from rtcd_jax.system.errors import Problem, closest
-from rtcd_jax.volume import OVER_TASKS, VOLUMES
+from rtcd_jax.volume import OBJECTIVES, OTHERS, OVER_TASKS, VOLUMES
 
 UNIT = "its unit"
 """Stands in a description for the unit that the plant gives."""
@@ -418,7 +418,7 @@ SMALLEST_POPULATION = 4
 if TYPE_CHECKING:
     Objective = OverTasks = str
 else:
-    Objective, OverTasks = Literal[tuple(VOLUMES)], Literal[tuple(OVER_TASKS)]
+    Objective, OverTasks = Literal[OBJECTIVES], Literal[tuple(OVER_TASKS)]
 
 
 REFINABLE = ("gains", "shapes")
@@ -429,7 +429,8 @@ REFINEMENT_STEPS = 400
 
 class SearchConfig(Settings):
     objective: Objective = Field(
-        default="sum", description="volume to maximize; goal: of the region there, without a motion"
+        default="sum",
+        description="volume to maximize; goal: of the region there, without a motion; dirtrel: 1 / l_w, for comparison",
     )
     at_least: dict[str, Annotated[float, Field(gt=0, le=1e12)]] = Field(
         default={},
@@ -475,6 +476,9 @@ class SearchConfig(Settings):
         for name in self.at_least:
             if name not in VOLUMES:
                 yield Problem(("at_least", name), f"must be a volume; {closest(name, tuple(VOLUMES))}")
+        if self.refine and self.objective in OTHERS:
+            text = f"goes up no {self.objective}: it needs a volume as search.objective"
+            yield Problem(("refine",), text, self.refine)
         if self.mode != "nested":
             return
         designs = self.nested.designs

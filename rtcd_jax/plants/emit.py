@@ -7,6 +7,7 @@ and equal expressions are written once. So what is lumped of masses and lengths 
 others with the same arithmetic.
 """
 
+import operator
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -69,15 +70,15 @@ class Program:
         return [registers[a.index] if isinstance(a, Node) else a for a in self.outputs]
 
 
+_ARITHMETIC = {"+": operator.add, "-": operator.sub, "*": operator.mul, "/": operator.truediv}
+
+
 def _run(
     instructions: Sequence[Instruction], registers: list[Any], sin: Callable | None = None, cos: Callable | None = None
 ) -> None:
-    operations = {
-        "+": lambda a, b: a + b, "-": lambda a, b: a - b, "*": lambda a, b: a * b, "/": lambda a, b: a / b,
-        "sin": sin, "cos": cos,
-    }  # fmt: skip
+    operations = _ARITHMETIC | {"sin": sin, "cos": cos}
     for target, operation, operands in instructions:
-        values = (registers[a.index] if isinstance(a, Node) else a for a in operands)
+        values = [registers[a.index] if a.__class__ is Node else a for a in operands]
         registers[target] = operations[operation](*values)
 
 

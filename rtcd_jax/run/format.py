@@ -11,14 +11,14 @@ import numpy as np
 
 from rtcd_jax.config.load import Config, config_hash
 from rtcd_jax.config.plants import PLANTS
-from rtcd_jax.evaluation import elite_budget
+from rtcd_jax.evaluation import elite_budget, volumes_of
 from rtcd_jax.genome import decode
 from rtcd_jax.numerics.proportion import failure_bound
 from rtcd_jax.policy import input_jumps, options
 from rtcd_jax.problem import Problem
 from rtcd_jax.types import Evaluation, Funnel, Policy, Status, TaskEvaluations, Trajectory
 from rtcd_jax.validation import PhysicsComparison
-from rtcd_jax.volume import VOLUMES, funnel_volume, largest_pushes
+from rtcd_jax.volume import largest_pushes
 
 
 def arrays_of(problem: Problem, evaluation: Evaluation) -> dict[str, np.ndarray]:
@@ -44,7 +44,7 @@ def arrays_of(problem: Problem, evaluation: Evaluation) -> dict[str, np.ndarray]
         "volumes_per_knot": volumes.per_knot,
         "pushes": _pushes(problem, evaluation)[0],
         **({} if host.funnel.offsets is None else {"center_offsets": host.funnel.offsets}),
-        **{f"volumes_{name}": volumes[name] for name in VOLUMES},
+        **{f"volumes_{name}": value for name, value in volumes.named.items()},
         "genome": host.genome,
     }
 
@@ -66,7 +66,7 @@ def evaluation_of(problem: Problem, arrays: Mapping[str, Any], record: Mapping[s
     borne = None if problem.uncertainty is None else jnp.ones(())
     offsets = jnp.asarray(arrays["center_offsets"]) if "center_offsets" in arrays else None
     funnel, candidate = Funnel(policy, levels, trials, policy.status, borne, offsets), decode(problem, genome)
-    volumes = funnel_volume(funnel, input_jumps(problem, candidate, policy.trajectory))
+    volumes = volumes_of(problem, candidate, funnel)
     return jax.device_get(Evaluation(genome, candidate, funnel, volumes, policy.status))
 
 
@@ -112,7 +112,7 @@ def record_of(
         "uncertainty": None if config.uncertainty.empty else config.uncertainty.model_dump(),
         "samples": int(funnel.trials.min()),
         "volumes": {
-            **{name: volumes[name] for name in VOLUMES},
+            **volumes.named,
             "share_of_largest_knot": float(volumes.per_knot.max() / max(volumes["sum"], np.finfo(float).tiny)),
         },
         "push": _push(problem, evaluation),
@@ -143,7 +143,7 @@ def common_record(problem: Problem, evaluation: TaskEvaluations) -> dict[str, An
     each = {
         name: {
             "status": Status(int(host.tasks.status[t])).name,
-            "volumes": {volume: host.tasks.volumes[volume][t] for volume in VOLUMES},
+            "volumes": {volume: values[t] for volume, values in host.tasks.volumes.named.items()},
         }
         for t, name in enumerate(config.tasks)
     }
@@ -155,7 +155,7 @@ def common_record(problem: Problem, evaluation: TaskEvaluations) -> dict[str, An
         "status": Status(int(host.status)).name,
         "rung": "sampled",
         "over_tasks": config.search.over_tasks,
-        "volumes": {name: host.volumes[name] for name in VOLUMES},
+        "volumes": dict(host.volumes.named),
         "tasks": each,
         "seed": config.search.seed,
         "config_hash": config_hash(config),
@@ -215,7 +215,7 @@ def epsilon(samples: np.ndarray, confidence: float, statements: int) -> float:
 
 def _spread(evaluations: Sequence[Evaluation]) -> dict[str, Any]:
     """Standard deviation over mean of every volume, over evaluations that differ in their random numbers alone."""
-    volumes = {name: [float(e.volumes[name]) for e in evaluations] for name in VOLUMES}
+    volumes = {name: [float(e.volumes[name]) for e in evaluations] for name in evaluations[0].volumes.named}
     relative = {
         name: np.std(values, ddof=1) / np.mean(values) if np.mean(values) else None for name, values in volumes.items()
     }

@@ -30,7 +30,6 @@ from rtcd_jax.system.cluster import Cluster, Preempted
 from rtcd_jax.system.console import Clock, Console, Progress, times
 from rtcd_jax.system.errors import UserError
 from rtcd_jax.types import Status, TaskEvaluations
-from rtcd_jax.volume import VOLUMES
 
 LAST_FILE = Path("initial.json")
 """Written when all else is: a folder that has it is complete."""
@@ -220,7 +219,7 @@ def summary(problem: Problem, initial: Reported, best: Reported) -> Iterator[str
     """The volumes of the initial and the best candidate with their spreads and ratios, and what the best one is."""
     before, after = record_of(problem, *initial), record_of(problem, *best)
     yield f"{'volume (sampled)':18}{'initial':>12}{'spread':>9}{'best':>12}{'spread':>9}{'ratio':>9}"
-    for name in VOLUMES:
+    for name in best.evaluation.volumes.named:
         cells = [f"{name:18}"]
         for record in (before, after):
             spread = record["spread"]["volumes"][name] if record["spread"] else None

@@ -34,7 +34,7 @@ from rtcd_jax.system.console import Clock, Console, Progress, table
 from rtcd_jax.system.errors import UserError
 from rtcd_jax.system.files import make_folder, replace, writing
 from rtcd_jax.types import Evaluation, Policy, Status
-from rtcd_jax.volume import VOLUMES, Knots
+from rtcd_jax.volume import OTHERS, VOLUMES, Knots
 
 PARTIAL = ".refinement.npz"
 """In the run folder, until the elites are written: where a refinement goes on after a kill."""
@@ -53,11 +53,14 @@ def refine_run(folder: Path, elites: int, free: tuple[str, ...], steps: int, con
     Goes on where an earlier call with the same arguments was stopped.
 
     Raises:
-        UserError: no run folder, a run without elites or one that is in use, or files that cannot be read or written.
+        UserError: no run folder, a run without elites or one that is in use, a run for several tasks or for no volume,
+            or files that cannot be read or written.
     """
     config = read_config(folder)
     if len(config.tasks) > 1 or task_of(folder):
         raise UserError(f"{folder} is for several tasks: an elite is refined for one, and would lose its place in them")
+    if config.search.objective in OTHERS:
+        raise UserError(f"{folder} searched for {config.search.objective}: a refinement goes up a volume of the funnel")
     with locked(folder):
         _finish_exchange(folder)
         stored = {name: read_elite(folder / "elites", name) for name in require_elites(folder)}

@@ -159,14 +159,15 @@ def _cells(case: Case, row: Mapping[str, Any]) -> list[str]:
 def _row(case: Case) -> dict[str, Any]:
     initial, best = (_volumes(case.folder, name) for name in ("initial", "000"))
     objective = case.config.search.objective
+    names = dict.fromkeys((*VOLUMES, objective))
     ratio = best[objective] / initial[objective] if best and initial and initial[objective] > 0 else None
     return {
         "case": case.number,
         **case.values,
         "generations": f"{_generations(case.folder)}/{case.config.search.generations}",
         "rung": "sampled" if best else None,
-        **{f"initial_{name}": initial.get(name) for name in VOLUMES},
-        **{f"best_{name}": best.get(name) for name in VOLUMES},
+        **{f"initial_{name}": initial.get(name) for name in names},
+        **{f"best_{name}": best.get(name) for name in names},
         "ratio": ratio,
         "run": case.folder.name,
     }

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from rtcd_jax.config.load import Config
-from rtcd_jax.volume import VOLUMES
+from rtcd_jax.volume import OTHERS, VOLUMES
 
 NONE = "–"
 """Stands where there is no number."""
@@ -44,6 +44,8 @@ def volume_unit(config: Config, volume: str = "sum") -> str:
 
     A push has the unit of an input times a second.
     """
+    if volume in OTHERS:
+        return OTHERS[volume].unit
     if VOLUMES[volume].push:
         return "·".join([*next(iter(config.plant.input_units.values())).split(), "s"])
     powers = Counter({"s": VOLUMES[volume].seconds})

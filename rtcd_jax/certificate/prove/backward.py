@@ -2,7 +2,8 @@
 
 On an interval the level follows the fastest growth of V, found on sampled directions, plus a decay margin: a rate that
 the level gives away so that V falls strictly. The limits on the states cap the level. The semidefinite program then
-only verifies. Where it fails, the decay margin is raised, then the interval halved, then the margin raised again.
+only verifies. Where it fails, the decay margin is raised, then the interval halved, then the margin raised again. Where
+it leaves much more than it needs, the interval is proved once more with a lower decay margin.
 """
 
 from collections.abc import Iterator
@@ -20,6 +21,10 @@ DECAY_MARGINS = {2: (0.005, 0.015, 0.04, 0.1), 4: (0.02, 0.06, 0.2, 0.5)}
 """By the number of states: decay margins [1/s] in the order of trial, before an interval is halved."""
 LARGE_DECAY_MARGINS = (0.25, 0.6, 1.5, 4.0, 10.0, 25.0)
 """Further ones for an interval of the shortest length."""
+RECLAIMED = 0.8
+"""Share of the certificates' margin by which the decay margin is lowered."""
+WASTED = 1 / 4
+"""Share of the decay margin beyond which the certificates' margin is worth a second attempt."""
 SHORTEST = 1 / 16
 """Shortest fraction of the knots' interval."""
 TIME_ORDER, MULTIPLIER = 5, 1
@@ -42,14 +47,14 @@ class Proved(NamedTuple):
 class ProofState(NamedTuple):
     """How far the proof has come: a fraction of an interval, the level and the ellipsoid there.
 
-    `first_trial` is the place of the decay margin that the next interval begins with.
+    `first_margin` [1/s] is the decay margin that the next interval begins with.
     """
 
     knot: int
     fraction: float
     rho: float
     axes: list
-    first_trial: int
+    first_margin: float
 
 
 @final
@@ -58,12 +63,12 @@ class BackwardProof:
 
     def __init__(self, claim: Claim, loop: Loop, exact: bool, solver: str = program.SOLVER):
         self.claim, self.loop, self.exact, self.solver = claim, loop, exact, solver
-        self._directions = unit_directions(claim.n)
+        self._directions, self._rates = unit_directions(claim.n), DECAY_MARGINS[claim.n]
 
     def outlet(self, rho: float) -> ProofState:
         """The state at which the proof begins: t_N with the level rho."""
         last = len(self.loop.u) - 1
-        return ProofState(last, 1.0, rho, on_grid(self.loop.axes(last, 1.0, rho, 0.0)[0]), 0)
+        return ProofState(last, 1.0, rho, on_grid(self.loop.axes(last, 1.0, rho, 0.0)[0]), self._rates[0])
 
     def intervals_from(self, state: ProofState) -> Iterator[Proved]:
         """The proved intervals from the state back to t = 0, or to where nothing can be proved."""
@@ -72,32 +77,35 @@ class BackwardProof:
         while waiting:
             k, start, end = waiting.pop()
             short = end - start <= SHORTEST
-            least = self._least_margin(k, start, end, state, short)
-            if least is None and short:
+            proved = self._least_margin(k, start, end, state, short)
+            if proved is None and short:
                 return
-            if least is None:
+            if proved is None:
                 middle = (start + end) / 2
                 waiting += [(k, start, middle), (k, middle, end)]
                 continue
-            trial, proved = least
-            state = ProofState(k, start, proved.rho, proved.interval.first, self.next_trial(trial, proved.margin))
+            first_margin = self.first_margin(proved.decay_margin, proved.margin)
+            state = ProofState(k, start, proved.rho, proved.interval.first, first_margin)
             yield proved
 
-    def next_trial(self, place: int, margin: float) -> int:
-        """The place of the decay margin that the next interval begins with: a lower one if `margin` allows it."""
-        rates = DECAY_MARGINS[self.claim.n]
-        place = min(place, len(rates) - 1)
-        return place - 1 if place and margin > rates[place] - rates[place - 1] else place
+    def first_margin(self, decay_margin: float, margin: float) -> float:
+        """The decay margin that the interval begins with which comes behind one of these margins."""
+        return min(self._lowered(decay_margin, margin), self._rates[-1])
 
-    def _least_margin(
-        self, k: int, start: float, end: float, state: ProofState, short: bool
-    ) -> tuple[int, Proved] | None:
-        """The least decay margin, by its place, with which the interval can be proved."""
-        rates = DECAY_MARGINS[self.claim.n] + (LARGE_DECAY_MARGINS if short else ())
-        for place in range(min(state.first_trial, len(rates) - 1), len(rates)):
-            proved = self._attempt(k, start, end, state, rates[place])
+    def _lowered(self, decay_margin: float, margin: float) -> float:
+        """A decay margin that the certificates' margin still allows, if that is much; the same if not."""
+        wasted = margin > max(WASTED * decay_margin, self._rates[0])
+        return max(self._rates[0], decay_margin - RECLAIMED * margin) if wasted else decay_margin
+
+    def _least_margin(self, k: int, start: float, end: float, state: ProofState, short: bool) -> Proved | None:
+        """The interval with nearly the least decay margin with which it can be proved."""
+        rates = self._rates + (LARGE_DECAY_MARGINS if short else ())
+        for rate in (state.first_margin, *(rate for rate in rates if rate > state.first_margin)):
+            proved = self._attempt(k, start, end, state, rate)
             if proved is not None:
-                return place, proved
+                lower = self._lowered(rate, proved.margin)
+                again = self._attempt(k, start, end, state, lower) if lower < rate else None
+                return again or proved
         return None
 
     def _attempt(self, k: int, start: float, end: float, state: ProofState, decay_margin: float) -> Proved | None:

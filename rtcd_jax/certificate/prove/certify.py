@@ -15,7 +15,7 @@ from rtcd_jax.certificate import check
 from rtcd_jax.certificate.check import Claim, GramCertificate, Node, Refused
 from rtcd_jax.certificate.enlarge import all_knots as joint
 from rtcd_jax.certificate.enlarge import knot_by_knot as backward
-from rtcd_jax.certificate.prove.backward import DECAY_MARGINS, BackwardProof, ProofState
+from rtcd_jax.certificate.prove.backward import BackwardProof, ProofState
 from rtcd_jax.certificate.prove.closed_loop import Loop, claim_of, double, doubles, with_digests
 from rtcd_jax.certificate.prove.goal import GoalRegion, goal_region
 from rtcd_jax.certificate.prove.levels import leveled, unit_directions
@@ -263,10 +263,8 @@ def _resumed(proof: BackwardProof, claim: Claim, outlet: float, journal: Journal
     for line in journal.lines:
         if "stretch" in line:
             interval = check.read_interval(Node("journal", line["stretch"]), claim)
-            rates = DECAY_MARGINS[claim.n]
-            trial = rates.index(line["spare"]) if line["spare"] in rates else len(rates) - 1
-            next_trial = proof.next_trial(trial, line["margin"])
-            state = ProofState(interval.knot, float(interval.start), line["rho"], interval.first, next_trial)
+            first_margin = proof.first_margin(line["spare"], line["margin"])
+            state = ProofState(interval.knot, float(interval.start), line["rho"], interval.first, first_margin)
     return state
 
 
