@@ -33,6 +33,8 @@ _STYLE = {
     "pdf.fonttype": 42,  # text that can be searched and edited
 }
 _DPI = 200
+WIDE = 1e4
+"""Ratio of a logarithmic axis' ends from which on it is labeled at powers of ten alone."""
 _FORMATS = {"solid": "-", "dashed": "--", "dotted": ":", "points": ".", "marked": ".-"}
 
 
@@ -41,7 +43,8 @@ def logarithmic(axes: "Axes") -> None:
     from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
     axes.set_yscale("log")
-    axes.yaxis.set_major_locator(LogLocator(subs=(1, 3), numticks=5))
+    low, high = axes.get_ylim()
+    axes.yaxis.set_major_locator(LogLocator(subs=(1, 3) if high < WIDE * low else (1,), numticks=5))
     axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
     axes.yaxis.set_minor_formatter(NullFormatter())
 

@@ -4,6 +4,7 @@ import functools
 import itertools
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from textwrap import fill
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -16,6 +17,9 @@ from rtcd_jax.analysis.report.shapes import planes
 from rtcd_jax.analysis.report.words import guarantee, listed, quantity, volume_unit, words
 from rtcd_jax.config.load import Config
 from rtcd_jax.volume import VOLUMES
+
+LINE = 120
+"""Characters of a legend's line that fit below a figure."""
 
 TUBE_POINTS = 41
 """Of an ellipse's outline in a funnel over time."""
@@ -132,8 +136,8 @@ def draw_plane(axes: "Axes", plane: Plane) -> None:
 def _frame(axes: "Axes", plane: Plane) -> None:
     """Start, goal, limits, window and labels of a plane."""
     # An open circle, so that small ellipsoids at the start, and the goal where it lies there too, are seen inside it.
-    for (x, y), marker, fill, name in ((plane.start, "o", "none", "start"), (plane.goal, "*", "white", "goal")):
-        axes.plot([x], [y], marker, mfc=fill, mec=BLACK, ms=9, ls="none", label=name, zorder=4)
+    for (x, y), marker, face, name in ((plane.start, "o", "none", "start"), (plane.goal, "*", "white", "goal")):
+        axes.plot([x], [y], marker, mfc=face, mec=BLACK, ms=9, ls="none", label=name, zorder=4)
     for axis, value in plane.visible_limits:
         (axes.axvline, axes.axhline)[axis](value, color=GRAY, ls="--", lw=1, label="state limit")
     for polygon in plane.kept_out:
@@ -198,13 +202,14 @@ def _volumes_label(config: Config, funnel: FunnelView) -> str:
     """The volumes with their guarantee."""
     known = _known_volumes(funnel).items()
     volumes = [f"{words(name)} {value:.4g} {volume_unit(config, name)}" for name, value in known]
-    return f"{funnel.label}: {', '.join(volumes)}\n{guarantee(funnel.elite.record)}"
+    line = fill(f"{funnel.label}: {', '.join(volumes)}", LINE)
+    return f"{line}\n{guarantee(funnel.elite.record)}"
 
 
 def _short_label(funnel: FunnelView) -> str:
     volumes = [f"{words(name)} {value:.3g}" for name, value in _known_volumes(funnel).items()]
     promise = f", ε = {funnel.elite.epsilon:.2g}" if funnel.elite.guarantee == "sampled" else ""
-    return f"{funnel.label}: {', '.join(volumes)} ({funnel.elite.guarantee}{promise})"
+    return fill(f"{funnel.label}: {', '.join(volumes)} ({funnel.elite.guarantee}{promise})", LINE)
 
 
 def _title(config: Config, funnel: FunnelView) -> str:
