@@ -76,9 +76,9 @@ _ARITHMETIC = {"+": operator.add, "-": operator.sub, "*": operator.mul, "/": ope
 def _run(
     instructions: Sequence[Instruction], registers: list[Any], sin: Callable | None = None, cos: Callable | None = None
 ) -> None:
-    operations = _ARITHMETIC | {"sin": sin, "cos": cos}
+    operations: dict[str, Any] = _ARITHMETIC | {"sin": sin, "cos": cos}
     for target, operation, operands in instructions:
-        values = [registers[a.index] if a.__class__ is Node else a for a in operands]
+        values = [registers[a.index] if isinstance(a, Node) else a for a in operands]
         registers[target] = operations[operation](*values)
 
 

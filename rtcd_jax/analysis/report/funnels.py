@@ -18,8 +18,8 @@ from rtcd_jax.analysis.report.words import guarantee, listed, quantity, volume_u
 from rtcd_jax.config.load import Config
 from rtcd_jax.volume import VOLUMES
 
-LINE = 120
-"""Characters of a legend's line that fit below a figure."""
+LINE, TITLE = 120, 100
+"""Characters of a line that fit into a figure, of a legend and of a title."""
 
 TUBE_POINTS = 41
 """Of an ellipse's outline in a funnel over time."""
@@ -169,7 +169,7 @@ def _beside(figure: "Figure", run: Run) -> None:
     if len(funnels) == 2:
         first, second = (_known_volumes(funnel) for funnel in funnels)
         ratios = [f"{words(name)} × {value / first[name]:.3g}" for name, value in second.items() if name in first]
-        below.set_title(f"{funnels[1].label} over {funnels[0].label}: {', '.join(ratios)}")
+        below.set_title(fill(f"{funnels[1].label} over {funnels[0].label}: {', '.join(ratios)}", TITLE))
     # The figure's legend, not the panel's: its width must not squeeze the panels.
     figure.legend(handles=below.lines, loc="outside lower center")
 
@@ -216,4 +216,4 @@ def _title(config: Config, funnel: FunnelView) -> str:
     record: Mapping[str, Any] = funnel.elite.record
     design = [listed(name, value, config.design_units[name]) for name, value in record["design"].items()]
     weights = [listed(name, value) for name, value in record["weights"].items()]
-    return "\n".join([funnel.label, ", ".join(design), ", ".join(weights)])
+    return "\n".join([funnel.label, *(fill(", ".join(each), TITLE // 2) for each in (design, weights))])
