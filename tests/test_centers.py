@@ -46,7 +46,7 @@ class Decay(Equations):
 def decaying(may: Uncertainty):
     """The decay from x = 3 without control: problem, candidate, policy."""
     data = yaml.safe_load(configuration.EXAMPLE) | {"trajectory": {"knots": KNOTS}}
-    problem = Problem(parse(data), Decay(), np.array([3.0]), np.zeros(1), np.array([LIMIT]), (), may)
+    problem = Problem(parse(data), Decay(), np.array([3.0]), np.zeros(1), np.array([LIMIT]), (), uncertainty=may)
     xs = 3 * jnp.exp(-DT * jnp.arange(KNOTS, dtype=float))[:, None]
     zero = jnp.zeros((), jnp.int32)
     motion = Trajectory(jnp.zeros((KNOTS - 1, 1)), xs, jnp.asarray(DT), *jnp.zeros((2,)), zero, zero)

@@ -54,7 +54,7 @@ def test_numbers_have_units_and_names_have_their_choices():
         assert named or unit or key in ROBOTS_OWN, key
         assert meaning
     told = rows()
-    assert told["search.objective"][2] == r"sum, integral, inlet, geometric\_mean, push, goal"
+    assert told["search.objective"][2] == r"sum, integral, inlet, geometric\_mean, push, goal, dirtrel"
     assert told["search.population"][:3] == ["-", "128", ">= 4 and <= 1048576"]
     assert told["policy.authority"][:3] == ["-", "1.0", ">= 1e-06 and <= 1"]
     assert "or a variable" in told["policy.authority"][3]
