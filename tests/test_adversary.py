@@ -57,7 +57,9 @@ def scalar_funnel(cubic: float, may: Uncertainty):
     """That of the uncontrolled system at rest, within |x| <= LIMIT."""
     data = yaml.safe_load(configuration.EXAMPLE) | {"trajectory": {"knots": 4}}
     plant = Scalar(cubic=cubic, limit=1.0)
-    problem = Problem(configuration.parse(data), plant, np.zeros(1), np.zeros(1), np.array([LIMIT]), (), uncertainty=may)
+    problem = Problem(
+        configuration.parse(data), plant, np.zeros(1), np.zeros(1), np.array([LIMIT]), (), uncertainty=may
+    )
     zero = jnp.zeros((), jnp.int32)
     rest = Trajectory(jnp.zeros((3, 1)), jnp.zeros((4, 1)), jnp.asarray(0.1), *jnp.zeros((2,)), zero, zero)
     policy = Policy(rest, jnp.zeros((4, 1, 1)), jnp.ones((4, 1, 1)), zero)

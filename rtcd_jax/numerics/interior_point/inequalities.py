@@ -41,7 +41,10 @@ class Linearized(NamedTuple):
     barrier: Float[Array, " P"]
 
     @classmethod
-    def of(cls, sets: tuple[Set, ...], at: Inequalities, xs: Float[Array, "knots n P"], barrier) -> "Linearized":
+    def of(
+        cls, sets: tuple[Set, ...], at: Inequalities, xs: Float[Array, "knots n P"], barrier: Float[Array, " P"]
+    ) -> "Linearized":
+        """At the knots xs, with the weight of the barrier."""
         slopes = [each.slopes(_inner(xs)) for each in sets]
         curvatures = [each.curvatures() for each in sets]
         return cls(at, misfits(sets, at.slacks, xs), slopes, curvatures, barrier)
