@@ -14,7 +14,7 @@ A start may be anywhere: r is a part of the violation that the filter brings to 
 from typing import NamedTuple
 
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from rtcd_jax.numerics.entries import Entry, Matrix, Row, plus, times
 from rtcd_jax.numerics.interior_point.boxes import largest, room, total
@@ -83,7 +83,7 @@ class Linearized(NamedTuple):
         along = (duals * self.misfits - self.barrier) / slacks * (steps.slacks - self.misfits)
         return -total(along) - self.barrier * total(steps.slacks / slacks)
 
-    def moved(self, steps: Inequalities, length, fraction) -> Inequalities:
+    def moved(self, steps: Inequalities, length: Float[Array, " P"], fraction: Float[Array, " P"]) -> Inequalities:
         """The slacks at a length, and the duals near barrier / slack there."""
         slacks, duals = self.at.slacks + length * steps.slacks, self.at.duals
         duals = duals + jnp.minimum(1.0, room(duals, steps.duals, fraction)) * steps.duals
@@ -103,7 +103,7 @@ def misfits(
     return _clearances(sets, xs) - slacks
 
 
-def kept(at: Linearized, tolerance: float):
+def kept(at: Linearized, tolerance: float) -> Bool[Array, " P"]:
     """Whether every c(x) is positive and agrees with its slack."""
     return (largest(at.misfits) <= tolerance) & (jnp.min(at.misfits + at.at.slacks, (0, 1)) > 0)
 
