@@ -174,7 +174,8 @@ def read_bundle(
     Raises:
         UserError: it is not there, cannot be read or has no funnel; a label that is no name in Python and C.
     """
-    elite = Elite.read(folder, name).of_all_robots()
+    stored = Elite.read(folder, name)
+    elite = stored.of_all_robots()
     label = _label(label or f"{elite.plant}_{name}")
     certificate = standing(folder, name, lambda done, of: show(done, of, "checking the certificate"))
     proof = ProvedFunnel.read(certificate_path(folder, name)) if certificate.proved else None
@@ -191,7 +192,7 @@ def read_bundle(
         joints=model.actuator_trnid[:, 0].copy(),
         standing=certificate,
         proof=proof,
-        control_rate=control_rate(elite, proof, lambda done, of: show(done, of, "trying control rates")),
+        control_rate=control_rate(stored, proof, lambda done, of: show(done, of, "trying control rates")),
         robustness=borne(folder, name),
     )
 
