@@ -1,5 +1,7 @@
 """One stored elite: found by its name in a run folder, read whole, or refused by one line that names what is wrong."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -94,3 +96,20 @@ def test_the_axes_of_an_ellipsoid_map_the_unit_sphere_onto_its_boundary():
     error = axes @ (y / np.linalg.norm(y))
     np.testing.assert_allclose(np.einsum("ki,kij,kj->k", error, elite.S, error), elite.rho)
     np.testing.assert_allclose(ellipsoid_axes(elite.S[0], elite.rho[0]), axes[0])
+
+
+def test_what_lies_in_every_robots_funnel_is_the_ellipsoid_about_x_less_the_farthest_center():
+    """A state of it is inside the stored ellipsoid about any center that is as far from x* as the offset says."""
+    elite = Elite.of(*balance.elite())
+    knots, n = elite.x.shape
+    offsets = np.linspace(0, 1.2, knots) * np.sqrt(elite.rho)  # the last ones are farther apart than the ellipsoids
+    common = replace(elite, center_offsets=offsets).of_all_robots()
+    assert elite.of_all_robots() is elite
+    assert np.all(common.rho > 0)
+    np.testing.assert_allclose(np.sqrt(common.rho) + offsets, np.maximum(np.sqrt(elite.rho), offsets), rtol=1e-5)
+    random = np.random.default_rng(0)
+    for k in np.flatnonzero(offsets < np.sqrt(elite.rho)):
+        y = random.normal(size=(2, 50, n))
+        inside, center = y / np.linalg.norm(y, axis=2, keepdims=True) @ ellipsoid_axes(elite.S[k], 1.0).T
+        apart = np.sqrt(common.rho[k]) * inside - offsets[k] * center
+        assert np.all(elite.value(k, elite.x[k] + apart) <= elite.rho[k] * (1 + 1e-9))
