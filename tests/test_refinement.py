@@ -62,7 +62,7 @@ def scalar() -> tuple[Refinement, list]:
     may = uncertainty(residual=0.5, noise=(0.0,), input=PUSH)
     zero = np.zeros(1)
     plant = Scalar(cubic=1.0, limit=1e-9)
-    problem = Problem(configuration.parse(data), plant, zero, zero, np.array([1.5]), (), may)
+    problem = Problem(configuration.parse(data), plant, zero, zero, np.array([1.5]), (), uncertainty=may)
     refinement = Refinement(problem, 40)
     return refinement, programs(refinement)
 

@@ -3,22 +3,22 @@
     {x : normal . x > offset},      {x : sum_i ((x_i - center_i) / semi_axis_i)^2 < 1}
 
 An infinite semi axis bounds nothing in that state. The boundaries are allowed. States have their components first and
-any further axes; numpy's arrays and JAX's serve alike.
+any further axes; numpy's arrays and JAX's serve alike, and JAX is imported where it is needed: stored elites are read
+without it.
 """
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from math import inf, isfinite
-from typing import Any, final
+from typing import TYPE_CHECKING, Any, final
 
-import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
-from rtcd_jax.numerics.batched import mtm, solve_lower, spd_solve
-from rtcd_jax.numerics.ellipsoid import Ellipsoids
-from rtcd_jax.numerics.loops import repeat
+if TYPE_CHECKING:
+    from jaxtyping import Array
+
+    from rtcd_jax.numerics.ellipsoid import Ellipsoids
 
 HALVINGS = 60
 """Of the logarithm of a multiplier between its bounds."""
@@ -53,12 +53,16 @@ class HalfSpace:
         """Whether the states [...] are inside; what is no number is not."""
         return _dot(self.normal, x) > self.offset
 
-    def fill(self, x: Any) -> Array:
+    def fill(self, x: Any) -> "Array":
         """The used share of the room, above 1 exactly inside; not a number for one."""
         return 1 + (_dot(self.normal, x) - self.offset) / self.room
 
-    def radii_clear(self, sets: Ellipsoids) -> Float[Array, " K"]:
+    def radii_clear(self, sets: "Ellipsoids") -> "Float[Array, ' K']":
         """The largest sqrt(rho) for which the ellipsoids do not meet the half space; 0 where the center is inside."""
+        import jax.numpy as jnp
+
+        from rtcd_jax.numerics.batched import solve_lower
+
         centers = sets.centers
         row = jnp.asarray(self.normal, centers.dtype)[:, None, None]
         support = jnp.sqrt(jnp.sum(solve_lower(sets.factors, row) ** 2, (0, 1)))
@@ -100,17 +104,25 @@ class Ellipsoid:
         """Whether the states [...] are inside; what is no number is not."""
         return self._form(x) < 1
 
-    def fill(self, x: Any) -> Array:
+    def fill(self, x: Any) -> "Array":
         """The inverse distance from the center in semi axes, above 1 exactly inside; not a number for one."""
+        import jax.numpy as jnp
+
         return 1 / jnp.sqrt(self._form(x))
 
-    def radii_clear(self, sets: Ellipsoids) -> Float[Array, " K"]:
+    def radii_clear(self, sets: "Ellipsoids") -> "Float[Array, ' K']":
         """The largest sqrt(rho) for which the ellipsoids do not meet this one; 0 where the center is inside.
 
         With W = diag(1 / semi_axis^2), M = W^1/2 S^-1 W^1/2 and a = W^1/2 (c - x), the least V on this ellipsoid is
         the largest l (a'(1 + l M)^-1 a - 1) over l >= 0, of which each is a bound from below. At the largest one
         |(1 + l M)^-1 a| = 1, and |a| - 1 lies between l times the least and l times the largest eigenvalue of M.
         """
+        import jax
+        import jax.numpy as jnp
+
+        from rtcd_jax.numerics.batched import mtm, solve_lower, spd_solve
+        from rtcd_jax.numerics.loops import repeat
+
         x, dtype = sets.centers, sets.centers.dtype
         bounded = np.flatnonzero(np.isfinite(self.semi_axes))
         scales = 1 / np.array(self.semi_axes)[bounded]
