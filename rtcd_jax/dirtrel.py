@@ -7,17 +7,16 @@ is held there, D the square of its half width. DIRTREL also keeps u* away from t
 on the ellipsoids E_k: |u*| + sqrt((K E K')_ii) <= u_max, its robust input constraint.
 """
 
+import jax
 import jax.numpy as jnp
+from jax.scipy.linalg import expm
 from jaxtyping import Array, Float
 
 from rtcd_jax.numerics.batched import mm, transpose
-from rtcd_jax.numerics.loops import packed_scan, repeat
+from rtcd_jax.numerics.loops import packed_scan
 from rtcd_jax.policy import linearize
 from rtcd_jax.problem import Problem
 from rtcd_jax.types import Candidate, Policy
-
-SQUARINGS, ORDER = 10, 4
-"""Of exp(M) = (Taylor polynomial of M / 2^10)^(2^10)."""
 
 
 def dirtrel(problem: Problem, candidate: Candidate, policy: Policy) -> Float[Array, ""]:
@@ -31,7 +30,8 @@ def dirtrel(problem: Problem, candidate: Candidate, policy: Policy) -> Float[Arr
     m = b.shape[1]
     width = jnp.ones(()) if uncertainty is None else jnp.where(uncertainty.input > 0, uncertainty.input, 1.0)
     above = jnp.concatenate([a - mm(b, gains), b], 1)
-    flow = _exponential(motion.dt * jnp.concatenate([above, jnp.zeros_like(above[:m])]))
+    generators = jnp.concatenate([above, jnp.zeros_like(above[:m])])
+    flow = jax.vmap(expm, in_axes=-1, out_axes=-1)(motion.dt * generators)
     n = a.shape[0]
     weight = jnp.diag(candidate.q)[..., None] + mm(transpose(gains), candidate.r[:, None, None] * gains)
 
@@ -48,12 +48,3 @@ def dirtrel(problem: Problem, candidate: Candidate, policy: Policy) -> Float[Arr
     share = jnp.min(jnp.where(asked > 0, room / jnp.sqrt(jnp.where(asked > 0, asked, 1)), jnp.inf))
     share = jnp.where(uncertainty.input > 0, jnp.clip(share, 0, 1), 1.0)
     return share / costs.sum()
-
-
-def _exponential(a: Float[Array, "n n K"]) -> Float[Array, "n n K"]:
-    """exp(A)."""
-    eye = jnp.broadcast_to(jnp.eye(a.shape[0], dtype=a.dtype)[..., None], a.shape)
-    small, total = a / 2**SQUARINGS, eye
-    for order in range(ORDER, 0, -1):
-        total = eye + mm(small, total) / order
-    return repeat(SQUARINGS, lambda root: mm(root, root), total)

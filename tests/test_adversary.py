@@ -40,16 +40,17 @@ LIMIT = 10.0
 
 @final
 class Scalar(Equations):
-    """x' = -x + cubic x^3 + u"""
+    """x' = -pace x + cubic x^3 + u"""
 
     cubic: float = 0.0
+    pace: float = 1.0
     limit: float = 1.0
 
     state_names: ClassVar = ("x",)
     state_units: ClassVar = ("m",)
 
     def dynamics(self, design, x, u):
-        return jnp.stack([-x[0] + self.cubic * x[0] ** 3 + u[0]])
+        return jnp.stack([-self.pace * x[0] + self.cubic * x[0] ** 3 + u[0]])
 
 
 @jax.jit

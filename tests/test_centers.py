@@ -1,7 +1,6 @@
 """Funnels about every robot's own motion: closed forms, the pendulum under a box, robots from inside it."""
 
 import dataclasses
-from typing import ClassVar, final
 
 import jax
 import jax.numpy as jnp
@@ -19,34 +18,20 @@ from rtcd_jax.system.errors import ConfigError
 from rtcd_jax.types import Candidate, Policy, Status, Trajectory, Uncertainty
 from rtcd_jax.validation import OwnMotions, Rollouts, validate_paths
 from tests import pipeline
-from tests.linear_system import Equations, Nothing
-from tests.test_adversary import estimator, situation, uncertainty
+from tests.linear_system import Nothing
+from tests.test_adversary import LIMIT, Scalar, estimator, situation, uncertainty
 
-LIMIT, KNOTS, DT = 10.0, 17, 0.5
+KNOTS, DT = 17, 0.5
 
 
 def moving(may: Uncertainty) -> Uncertainty:
     return dataclasses.replace(may, moving=True)
 
 
-@final
-class Decay(Equations):
-    """x' = -pace x + u"""
-
-    pace: float = 1.0
-    limit: float = 1.0
-
-    state_names: ClassVar = ("x",)
-    state_units: ClassVar = ("m",)
-
-    def dynamics(self, design, x, u):
-        return jnp.stack([-self.pace * x[0] + u[0]])
-
-
 def decaying(may: Uncertainty):
     """The decay from x = 3 without control: problem, candidate, policy."""
     data = yaml.safe_load(configuration.EXAMPLE) | {"trajectory": {"knots": KNOTS}}
-    problem = Problem(parse(data), Decay(), np.array([3.0]), np.zeros(1), np.array([LIMIT]), (), uncertainty=may)
+    problem = Problem(parse(data), Scalar(), np.array([3.0]), np.zeros(1), np.array([LIMIT]), (), uncertainty=may)
     xs = 3 * jnp.exp(-DT * jnp.arange(KNOTS, dtype=float))[:, None]
     zero = jnp.zeros((), jnp.int32)
     motion = Trajectory(jnp.zeros((KNOTS - 1, 1)), xs, jnp.asarray(DT), *jnp.zeros((2,)), zero, zero)

@@ -11,6 +11,7 @@ tolerance RUN --uncertainty BOX` and by `rtcd disturb RUN`.
 import argparse
 import dataclasses
 from collections.abc import Iterator, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +30,7 @@ def evaluated(config: Path, count: int, seed: int) -> tuple[dict[str, Any], dict
     import jax.numpy as jnp
 
     from rtcd_jax.config.load import load
+    from rtcd_jax.dirtrel import dirtrel
     from rtcd_jax.elite.elite import Elite
     from rtcd_jax.evaluation import make_evaluate
     from rtcd_jax.problem import make_problem
@@ -44,9 +46,10 @@ def evaluated(config: Path, count: int, seed: int) -> tuple[dict[str, Any], dict
         name: jax.device_get(jax.jit(make_evaluate(problem))(genomes, jax.random.key(seed)))
         for name, problem in (("nominal", nominal), ("robust", robust))
     }
+    inverse_cost = jax.jit(partial(dirtrel, nominal))
     rows = np.flatnonzero(host["nominal"].status == Status.OK)
     elites, indicators = {}, {f"{kind} {name}": [] for kind in host for name in VOLUMES}
-    indicators |= {name: [] for name in ("least volume of a knot", "spare input", "- DIRTREL's l_w")}
+    indicators |= {name: [] for name in ("least volume of a knot", "spare input", "1 / DIRTREL's l_w")}
     for row in rows:
         one = jax.tree.map(lambda leaf, row=row: leaf[row], host["nominal"])
         elite = Elite.of(arrays_of(nominal, one), plain(record_of(nominal, one)))
@@ -56,25 +59,8 @@ def evaluated(config: Path, count: int, seed: int) -> tuple[dict[str, Any], dict
                 indicators[f"{kind} {name}"].append(evaluation.volumes[name][row])
         indicators["least volume of a knot"].append(elite.volumes_per_knot.min())
         indicators["spare input"].append(1 - np.mean(np.abs(elite.u) / elite.u_max))
-        indicators["- DIRTREL's l_w"].append(-dirtrel(elite))
+        indicators["1 / DIRTREL's l_w"].append(float(inverse_cost(one.candidate, one.funnel.policy)))
     return elites, {name: np.array(values) for name, values in indicators.items()}
-
-
-def dirtrel(elite: Any) -> float:
-    """l_w = sum_k tr((Q + K_k'R K_k) E_k), E_k+1 = A_k E_k A_k' + G_k G_k', from E_0 = 0 and unit disturbances of u."""
-    from scipy.linalg import expm
-
-    from rtcd_jax.elite.funnel import linearized
-    from rtcd_jax.elite.simulators import dynamics_of
-
-    n, m, dt = elite.x_goal.size, elite.u_max.size, elite.time[1]
-    a, b = linearized(dynamics_of(elite), elite.x[:-1], elite.u)
-    spread, total = np.zeros((n, n)), 0.0
-    for a_k, b_k, k in zip(a, b, elite.K[:-1], strict=True):
-        flow = expm(dt * np.block([[a_k - b_k @ k, b_k], [np.zeros((m, n + m))]]))
-        spread = flow[:n, :n] @ spread @ flow[:n, :n].T + flow[:n, n:] @ flow[:n, n:].T
-        total += np.trace((elite.Q + k.T @ elite.R @ k) @ spread)
-    return float(total)
 
 
 def simulated(elites: Mapping[str, Any], seed: int) -> dict[str, np.ndarray]:

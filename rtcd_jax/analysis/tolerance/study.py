@@ -4,6 +4,7 @@ import csv
 import dataclasses
 import io
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -50,17 +51,17 @@ def tolerance_run(folder: Path, which: int | str, file: Path | None, console: Co
     evaluate = _program(problem, elite)
     console.message(f"{len(boxes)} boxes in one program: compiling takes a minute or so")
 
-    def bears(factors: Float[np.ndarray, " B"]) -> Bool[np.ndarray, " B"]:
+    def bears(boxes: list[Side], factors: Float[np.ndarray, " B"]) -> Bool[np.ndarray, " B"]:
         return np.asarray(evaluate(stacked(boxes, factors))[0])
 
-    factors = largest_factors(bears, np.array([side.most for side in boxes]), _teller(boxes, console))
+    factors = largest_factors(partial(bears, boxes), np.array([side.most for side in boxes]), _teller(boxes, console))
     _, volumes = evaluate(stacked(boxes, factors))
     numbers = {name: np.asarray(values) for name, values in volumes.items()}
     place, name, box = folder / FOLDER, elite_name(which), problem.config.uncertainty
     rows = _rows(boxes, factors, numbers)
     if (own := about_own_motions(problem, boxes[-1])) is not None:
         console.message("the whole box once more, each robot about its own motion")
-        factor = largest_factors(lambda factors: np.asarray(evaluate(stacked([own], factors))[0]), np.array([own.most]))
+        factor = largest_factors(partial(bears, [own]), np.array([own.most]), _teller([own], console))
         _, there = evaluate(stacked([own], factor))
         rows += _rows([own], factor, {name: np.asarray(values) for name, values in there.items()})
     if prove:
