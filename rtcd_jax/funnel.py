@@ -3,10 +3,11 @@
     rho_k = sup {rho : every sampled x with V_k(x) <= rho stays inside the boxes and ends with V_{k+1} <= rho_{k+1}}
 
 (paper, section II-D.2, by simulation), knot by knot backward from rho_N, which comes from long rollouts under the
-goal's LQR. At every knot states are rolled out along rays through the set, on a ladder of radii about the next level's.
-Few random directions come near the worst one, and what each knot misses multiplies along the motion: the worst one is
-climbed to, from where it was at knot k+1. Held-out samples validate the whole (validation.py). Where every robot of an
-uncertainty has its own center (centers.py), all this is for each of its corners, and the smallest radius counts.
+goal's LQR or, where the motion ends in a catch set, is that set's own level. At every knot states are rolled out along
+rays through the set, on a ladder of radii about the next level's. Few random directions come near the worst one, and
+what each knot misses multiplies along the motion: the worst one is climbed to, from where it was at knot k+1. Held-out
+samples validate the whole (validation.py). Where every robot of an uncertainty has its own center (centers.py), all
+this is for each of its corners, and the smallest radius counts.
 """
 
 from functools import partial
@@ -25,12 +26,13 @@ from rtcd_jax.numerics.batched import solve_lower
 from rtcd_jax.numerics.ellipsoid import Ellipsoids
 from rtcd_jax.numerics.loops import packed_scan, short_scan
 from rtcd_jax.numerics.sphere import climb
+from rtcd_jax.policy import catch_weight
 from rtcd_jax.problem import Problem
 from rtcd_jax.types import Candidate, Funnel, Policy, Status, first_failure
 from rtcd_jax.validation import Rollouts, SamplingBudget, validate_intervals, validate_paths
 
 SMALLEST = 1e-3
-"""Radius below which a set counts as empty, over the box's or that at which the goal's LQR saturates."""
+"""Radius below which a set counts as empty, over the box's, that at which the last gain saturates, or a catch set's."""
 
 REACH = 1e3
 """Radius up to which sets are looked for, over that at which the goal's LQR saturates: states may have no limits."""
@@ -69,7 +71,12 @@ def estimate_funnel(
     boxes = for_each(rollouts.robots, lambda robot: _clear_radii(problem, rollouts.about(robot).sets))
     boxes = boxes if rollouts.robots is None else jnp.min(boxes, 0)
     boxes = jnp.minimum(boxes, REACH * saturated)
-    last = goal_level(rollouts, boxes[-1], saturated, keys[0], budget)
+    scales = jnp.minimum(boxes, saturated)
+    if problem.catch is None:
+        last = goal_level(rollouts, boxes[-1], saturated, keys[0], budget)
+    else:
+        caught = catch_weight(problem, candidate)
+        last, scales = jnp.minimum(caught, boxes[-1] ** 2), jnp.minimum(scales, jnp.sqrt(caught))
     offsets = rollouts.offsets()
     if offsets is not None:
         last = jnp.maximum(jnp.sqrt(last) - offsets[-1], 0) ** 2
@@ -78,7 +85,7 @@ def estimate_funnel(
     levels, samples = validate_intervals(rollouts, levels, keys[2], budget)
     if budget.samples_per_knot:
         levels, samples = validate_paths(rollouts, levels, keys[3], budget, samples_per_knot)
-    filled = (levels >= (jnp.minimum(boxes, saturated) * SMALLEST) ** 2) & (boxes > 0)
+    filled = (levels >= (scales * SMALLEST) ** 2) & (boxes > 0)
     full = jnp.all(filled)
     finite = jnp.all(jnp.isfinite(levels)) & jnp.all(jnp.isfinite(policy.values))
     empty = jnp.where(rollouts.stiffness.too_stiff, Status.TOO_STIFF, Status.FUNNEL_EMPTY)

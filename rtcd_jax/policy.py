@@ -2,7 +2,8 @@
 
 S solves -S' = A'S + S A - S B R^-1 B' S + Q backward along (x*, u*), from the value matrix of the goal's own
 infinite-horizon LQR with the same Q and R; K = R^-1 B' S (paper, section II-C). The whole closed loop thereby has one
-value function that continues through t_N.
+value function that continues through t_N. Where the motion ends in a catch set {x : (x - goal)'C(x - goal) <= 1}
+instead, the value matrix there is catch_weight C, and t_N is the end.
 
 The policy options, the configuration's or the search's, may make the controller leave authority: A becomes A + alpha I,
 and R becomes w R / max(1 - |u*| / u_max, authority)^2 with the interval's own u*. The defaults, alpha = 0 and
@@ -66,10 +67,15 @@ def linearize(
     return both[:, :n], both[:, n:]
 
 
+def inputs_at_knots(problem: Problem, trajectory: Trajectory) -> Float[Array, "m knots"]:
+    """u* of the interval that begins at each knot: at the last one that of rest or, in a catch set, the last held."""
+    last = jnp.zeros_like(trajectory.us[:1]) if problem.catch is None else trajectory.us[-1:]
+    return jnp.concatenate([trajectory.us, last]).T
+
+
 def input_jumps(problem: Problem, candidate: Candidate, trajectory: Trajectory) -> Float[Array, "knots n m"]:
     """B at the knots: by how much the state jumps for a unit impulse on each input [1/(input's unit s)]."""
-    at_rest = jnp.zeros_like(trajectory.us[:1])
-    _, b = linearize(problem, candidate, trajectory.xs.T, jnp.concatenate([trajectory.us, at_rest]).T)
+    _, b = linearize(problem, candidate, trajectory.xs.T, inputs_at_knots(problem, trajectory))
     return jnp.moveaxis(b, -1, 0)
 
 
@@ -79,7 +85,7 @@ def stabilize(problem: Problem, candidate: Candidate, trajectory: Trajectory) ->
     motion = nominal(problem, candidate, trajectory)
     middles = (np.arange(substeps) + 0.5) / substeps
     xs = motion.at(middles)
-    inputs = jnp.concatenate([motion.inputs, jnp.zeros_like(motion.inputs[:, :1])], 1)
+    inputs = inputs_at_knots(problem, trajectory)
     weights = input_weights(problem, candidate, inputs)
     us = jnp.broadcast_to(motion.inputs[:, :, None], (problem.plant.m, *xs.shape[1:]))
     pieces = _interval(problem, candidate, xs, us, weights[:, :-1, None], trajectory.dt / substeps)
@@ -87,7 +93,7 @@ def stabilize(problem: Problem, candidate: Candidate, trajectory: Trajectory) ->
     for piece in range(1, substeps):
         whole = riccati.compose(whole, jax.tree.map(lambda leaf, piece=piece: leaf[..., piece], pieces))
 
-    last, reached = goal_value(problem, candidate)
+    last, reached = final_value(problem, candidate)
 
     def backward(carry, interval):
         value, definite = riccati.propagate(interval, carry[0])
@@ -118,8 +124,10 @@ def value_rates(problem: Problem, candidate: Candidate, policy: Policy) -> Float
     return jnp.moveaxis(square - mm(transpose(a), s) - mm(s, a) - q, (2, 3), (0, 1))
 
 
-def goal_value(problem: Problem, candidate: Candidate) -> tuple[Float[Array, "n n"], Bool[Array, ""]]:
-    """S of the goal's infinite-horizon LQR, and whether it exists."""
+def final_value(problem: Problem, candidate: Candidate) -> tuple[Float[Array, "n n"], Bool[Array, ""]]:
+    """S of the goal's infinite-horizon LQR, and whether it exists; that of the catch set where there is one."""
+    if problem.catch is not None:
+        return catch_weight(problem, candidate) * jnp.asarray(problem.catch, candidate.q.dtype), jnp.asarray(True)
     goal = jnp.asarray(problem.goal, candidate.q.dtype)
     rest = jnp.zeros(problem.plant.m, goal.dtype)
     a, b = _discounted(problem, candidate, *linearize(problem, candidate, goal, rest))
@@ -130,6 +138,12 @@ def goal_value(problem: Problem, candidate: Candidate) -> tuple[Float[Array, "n 
 def options(problem: Problem, candidate: Candidate) -> dict[str, Any]:
     """The policy's options by name: the candidate's, or else the configuration's."""
     return problem.config.policy.initial() | candidate.policy
+
+
+def catch_weight(problem: Problem, candidate: Candidate) -> Float[Array, ""]:
+    """V on the boundary of the catch set: the candidate's, or else the configuration's."""
+    known: Any = problem.config.policy.catch_weight
+    return jnp.asarray(candidate.policy.get("catch_weight", known), candidate.q.dtype)
 
 
 def input_weights(problem: Problem, candidate: Candidate, us: Float[Array, "m *batch"]) -> Float[Array, "m *batch"]:

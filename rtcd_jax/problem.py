@@ -63,6 +63,12 @@ class Problem:
     """Sets of states that no motion enters."""
     uncertainty: Uncertainty | None = None
     """What the funnels must bear; None for one exact model."""
+    catch: Float[np.ndarray, "n n"] | None = None
+    """C of the catch set {x : (x - goal)' C (x - goal) <= 1} in which the motions end, and no time follows; None where
+    the goal is an equilibrium that is held.
+    """
+    cost_center: Float[np.ndarray, " n"] | None = None
+    """From where the trajectory's cost counts; None for the goal."""
     tasks: tuple["Problem", ...] = ()
     """Where there are several: each alone. Start, goal and the robot's constants are then the first one's."""
 
@@ -119,7 +125,8 @@ def make_problem(config: Config) -> Problem:
 
     Raises:
         UserError: if JAX computes in float32.
-        ConfigError: if a goal is no equilibrium of the initial design without input, or cannot be stabilized there.
+        ConfigError: if a goal that is to be held is no equilibrium of the initial design without input, or cannot be
+            stabilized there.
         UserError: if the robot's MJCF does not move as its equations say, at random states, inputs and designs.
     """
     require_float64()
@@ -131,19 +138,22 @@ def make_problem(config: Config) -> Problem:
 
 
 def _make_problem(config: Config, path: tuple[str, ...]) -> Problem:
-    plant = make_plant(config.plant, config.design_units)
+    plant, task = make_plant(config.plant, config.design_units), config.task
     problem = Problem(
         config=config,
         plant=plant,
         start=np.array(config.start, float),
-        goal=np.array(config.task.goal, float),
-        state_limits=np.array(config.task.state_limits, float),
+        goal=np.array(task.goal, float),
+        state_limits=np.array(task.state_limits, float),
         variables=tuple(_variables(config)),
         keep_out=_keep_out(config),
         uncertainty=_uncertainty(config),
+        catch=np.diag(1 / np.square(task.catch.half_widths)) if task.caught else None,
+        cost_center=np.array(task.cost_center, float) if task.cost_center else None,
     )
-    _require_equilibrium(problem, path)
-    _require_stabilizable(problem, path)
+    if problem.catch is None:
+        _require_equilibrium(problem, path)
+        _require_stabilizable(problem, path)
     _require_agreement(problem)
     return problem
 

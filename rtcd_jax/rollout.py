@@ -1,8 +1,9 @@
 """Policy x states -> end states: the saturated closed loop, by the closed form or by MJX.
 
 On [t_k, t_{k+1}] with the fraction s of the interval:  u = clip(u_k - K(s) (x - x*(s))), x* the cubic Hermite
-interpolant, K linear between K_k and K_{k+1}; after t_N the goal's LQR. Errors of angles are not wrapped. States are
-[n ...], elementwise over all further axes, so that one call carries every knot and sample of a candidate.
+interpolant, K linear between K_k and K_{k+1}; after t_N the goal's LQR, if the goal is held. Errors of angles are not
+wrapped. States are [n ...], elementwise over all further axes, so that one call carries every knot and sample of a
+candidate.
 """
 
 from collections.abc import Callable
@@ -21,7 +22,7 @@ from rtcd_jax.numerics.batched import mm, spectral_radius
 from rtcd_jax.numerics.integrate import END, MIDDLE, STABLE, START, rk4_varying_step, split
 from rtcd_jax.numerics.loops import short_scan
 from rtcd_jax.plants.base import Plant
-from rtcd_jax.policy import linearize, nominal
+from rtcd_jax.policy import inputs_at_knots, linearize, nominal
 from rtcd_jax.problem import Problem
 from rtcd_jax.types import Candidate, Policy
 
@@ -202,10 +203,10 @@ class Stiffness(NamedTuple):
 
 def stiffness(problem: Problem, candidate: Candidate, policy: Policy, funnel: FunnelConfig) -> Stiffness:
     """How fast the loop is for the steps of its rollouts; where it is too fast, or not finite, one part has to do."""
-    inputs = jnp.pad(policy.trajectory.us.T, ((0, 0), (0, 1)))
+    inputs = inputs_at_knots(problem, policy.trajectory)
     a, b = linearize(problem, candidate, policy.trajectory.xs.T, inputs)
     fastest = spectral_radius(a - mm(b, jnp.moveaxis(policy.gains, 0, -1)))
-    parts = jnp.ceil(fastest[-1] * funnel.goal.step / STABLE)
+    parts = jnp.ceil(fastest[-1] * funnel.goal.step / STABLE) if problem.catch is None else jnp.ones_like(fastest[-1])
     along = jnp.max(fastest) * policy.trajectory.dt / funnel.steps
     too_stiff = (parts > MOST_PARTS) | (along > STABLE)
     return Stiffness(jnp.where((parts > 1) & ~too_stiff, parts, 1).astype(int), too_stiff)

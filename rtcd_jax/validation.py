@@ -100,6 +100,11 @@ class Rollouts(NamedTuple):
     def intervals(self) -> int:
         return self.sets.centers.shape[1] - 1
 
+    @property
+    def time_behind(self) -> float:
+        """For how long states are followed after t_N [s]: not at all from a catch set."""
+        return self.goal.horizon if self.problem.catch is None else 0.0
+
     def roll(
         self, tracking: rollout.TrackingData, x: Float[Array, "n intervals *batch"], dynamics: rollout.Dynamics
     ) -> tuple[Float[Array, "n intervals *batch"], Float[Array, "intervals *batch"]]:
@@ -125,8 +130,11 @@ class Rollouts(NamedTuple):
     ) -> tuple[Float[Array, "n S"], Bool[Array, " S"]]:
         """States after the horizon behind t_N, and whether they came closer to the goal, inside the boxes.
 
-        Against an opponent it is enough that they stay in the residual set of the region of level `last`.
+        Against an opponent it is enough that they stay in the residual set of the region of level `last`. With a catch
+        set the motion is over: the states are those of t_N, and nothing is asked.
         """
+        if self.problem.catch is not None:
+            return x, jnp.ones(x.shape[1:], bool)
         ends, peaks = self.at_goal(x, dynamics)
         before, after = self.level(x, self.intervals), self.level(ends, self.intervals)
         closer = after < before
@@ -246,9 +254,10 @@ def validate_paths(
 
     Where every robot has its own center, it is followed beside the state of its funnel from x*(0) on.
 
-    A state fails if it leaves the funnel at a later knot, leaves the boxes, or does not come closer to the goal (by its
-    V) over the horizon after t_N. Wherever a path leaves the funnel, the level from which it left is the one to shrink:
-    paths of many knots run together, into corners that states uniform in that knot's ellipsoid hardly visit.
+    A state fails if it leaves the funnel at a later knot, leaves the boxes, or, where the goal is held, does not come
+    closer to it (by its V) over the horizon after t_N. Wherever a path leaves the funnel, the level from which it left
+    is the one to shrink: paths of many knots run together, into corners that states uniform in that knot's ellipsoid
+    hardly visit.
 
     The states of a round go in batches, knot by knot from the last one, since a path needs the levels of later knots
     alone: each batch finds the levels as the batches before left them, and a round without failures leaves them as they
@@ -465,7 +474,7 @@ def compare_physics(
         failures=jnp.sum(pairs.failed.reshape(-1)[:states]),
         difference=pairs.difference[where],
         knot=jnp.asarray(born)[where],
-        time=jnp.where(place == knots, (knots - 1) * dt + rollouts.goal.horizon, place * dt),
+        time=jnp.where(place == knots, (knots - 1) * dt + rollouts.time_behind, place * dt),
         start=pairs.starts[where[0], :, where[1]],
         closed_form=closed,
         mjx=other,

@@ -12,7 +12,7 @@ from scipy.integrate import solve_ivp
 from scipy.interpolate import CubicHermiteSpline
 
 from rtcd_jax.config.load import load
-from rtcd_jax.policy import goal_value, linearize, nominal, options, stabilize
+from rtcd_jax.policy import final_value, linearize, nominal, options, stabilize
 from rtcd_jax.problem import make_problem
 from rtcd_jax.trajectory import plan
 from rtcd_jax.types import Candidate, Status
@@ -291,6 +291,6 @@ def test_the_goal_s_lqr_is_discounted_too(problem, cautious, candidates):
     soft = take(candidates, SOFT)
     a, b = (np.asarray(m) for m in linearize(problem, soft, jnp.asarray(problem.goal), jnp.zeros(1)))
     expected = scipy.linalg.solve_continuous_are(a + 0.7 * np.eye(2), b, np.diag(Q[SOFT]), 0.3 * R[SOFT][:, None])
-    found, reached = goal_value(cautious, soft)
+    found, reached = final_value(cautious, soft)
     assert reached
     np.testing.assert_allclose(found, expected, rtol=1e-8)

@@ -102,6 +102,10 @@ def show_run(path: Path, console: Console) -> Iterator[str]:
     )
     yield f"generations: {course.generations} of {search.population} candidates"
     yield f"bears: {bears}"
+    task = course.config.task
+    if task.caught:
+        within = task.catch.in_words(course.config.plant.states)
+        yield f"ends in a catch set: {within}; of the time after it nothing is said"
     if not course.complete:
         yield "not finished: the command that began it goes on"
         return
@@ -127,7 +131,9 @@ def show_run(path: Path, console: Console) -> Iterator[str]:
     )
     yield f"guarantee: {guarantee(run.best.record)}"
     certificate = run.certificates.get("000")
-    if certificate is None:
+    if task.caught:
+        yield "proof: none of a catch set"
+    elif certificate is None:
         yield f"proof: none yet; rtcd certify {path}"
     elif certificate.guarantee is None:
         yield f"proof: none, certificate {certificate.verdict}: {certificate.reason}"
@@ -135,7 +141,8 @@ def show_run(path: Path, console: Console) -> Iterator[str]:
         yield f"proof: {certificate.guarantee} from {certificate.start:.4g} s on, {certificate.intervals} intervals"
     yield f"verification: {verdict(run) or f'none yet; rtcd verify {path}'}"
     tried = ", ".join(words(experiment.name) for experiment in run.experiments)
-    yield f"disturbance: {tried or f'none yet; rtcd disturb {path}'}"
+    if not task.caught:
+        yield f"disturbance: {tried or f'none yet; rtcd disturb {path}'}"
 
 
 def _cell(value: Cell) -> str:

@@ -173,6 +173,9 @@ def _sizes(plant: PlantConfig, task: TaskConfig) -> Iterator[Problem]:
         for key in ("normal", "center", "semi_axes"):
             if value := getattr(each, key):
                 yield from _size(("task", "keep_out", i, key), value, plant.states)
+    for path, value in (("catch", "half_widths"), task.catch.half_widths), (("cost_center",), task.cost_center):
+        if value:
+            yield from _size(("task", *path), value, plant.states)
 
 
 def _weight_sizes(plant: PlantConfig, weights: WeightsConfig) -> Iterator[Problem]:
@@ -197,6 +200,26 @@ def _ends(task: TaskConfig, trajectory: TrajectoryConfig) -> Iterator[Problem]:
                 text = f"must lie in [-{share * limit:g}, {share * limit:g}] (trajectory.limit_share of the limit)"
                 yield Problem(("task", key, i), text, value)
         yield from _outside(task, key, share)
+    caught = zip(task.goal, task.catch.half_widths, task.state_limits, strict=False)
+    for i, (value, width, limit) in enumerate(caught):
+        if abs(value) + width > limit:
+            text = (
+                f"must lie in [{width - limit:g}, {limit - width:g}]: the catch set reaches {width:g} from it "
+                "(task.catch.half_widths), and task.state_limits hold in all of it"
+            )
+            yield Problem(("task", "goal", i), text, value)
+
+
+def _catch(task: TaskConfig, policy: PolicyConfig, search: SearchConfig) -> Iterator[Problem]:
+    if not task.caught:
+        if policy.weighs_catch:
+            yield Problem(("policy", "catch_weight"), "needs task.catch.half_widths: without a catch set it has no use")
+        return
+    if search.objective == GOAL:
+        text = "must be another one with task.catch: at a goal that is no equilibrium there is no region"
+        yield Problem(("search", "objective"), text, search.objective)
+    if search.refine:
+        yield Problem(("search", "refine"), "must be false with task.catch: a refinement needs the goal's region", True)
 
 
 def _outside(task: TaskConfig, key: str, share: float) -> Iterator[Problem]:
@@ -339,6 +362,7 @@ _ACROSS: tuple[Callable[..., Iterator[Problem]], ...] = (
     _sizes,
     _weight_sizes,
     _ends,
+    _catch,
     _motion,
     _tasks,
     _design_names,

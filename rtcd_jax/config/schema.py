@@ -77,6 +77,7 @@ class Variable(Settings):
 # Strictness is for the numbers: YAML's lists become tuples.
 Numbers = Annotated[tuple[Annotated[float, Field(ge=-1e6, le=1e6), ARITHMETIC], ...], Field(strict=False)]
 Limits = Annotated[tuple[Annotated[float, Field(ge=1e-6, allow_inf_nan=True), ARITHMETIC], ...], Field(strict=False)]
+Widths = Annotated[tuple[Annotated[float, Field(ge=1e-6, le=1e6), ARITHMETIC], ...], Field(strict=False)]
 LARGEST_LIMIT = 1e6
 LARGEST_OFFSET = 1e9
 Variables = Annotated[tuple[Variable, ...], Field(strict=False)]
@@ -140,19 +141,48 @@ class KeepOutConfig(Settings):
         return 1 - sum(((a - c) / axis) ** 2 for a, c, axis in parts) * share**2
 
 
+class CatchConfig(Settings):
+    """The set {x : (x - goal)' C (x - goal) <= 1}, C the diagonal of 1 / half width^2."""
+
+    half_widths: Widths = Field(
+        default=(),
+        description="of an ellipsoid about the goal in which the motion ends, that of all tasks; empty: the goal is an "
+        f"equilibrium that is held [{UNIT}]",
+    )
+
+    def in_words(self, states: Mapping[str, str]) -> str:
+        """The half widths of states that are given with their units."""
+        widths = zip(states.items(), self.half_widths, strict=True)
+        return ", ".join(f"{name} ± {width:.6g} {unit}" for (name, unit), width in widths)
+
+
 class TaskConfig(Settings):
     start: Numbers = Field(description=f"first state of the nominal motion, pinned [{UNIT}]")
-    goal: Numbers = Field(description=f"last state of the nominal motion, pinned, an equilibrium [{UNIT}]")
+    goal: Numbers = Field(
+        description=f"last state of the nominal motion, pinned, an equilibrium unless there is a `catch` [{UNIT}]"
+    )
     state_limits: Limits = Field(
         description=f"largest |x_i|, at most 1e6, or .inf for none; leaving them is a failure [{UNIT}]"
     )
     keep_out: Annotated[tuple[KeepOutConfig, ...], Field(strict=False)] = Field(
         default=(), description="sets of states to keep out of, of all tasks; entering one is a failure"
     )
+    catch: CatchConfig = Field(
+        default=CatchConfig(), description="a set about the goal in which the motion ends, of all tasks"
+    )
+    cost_center: Numbers = Field(
+        default=(), description=f"state from which the trajectory's cost counts, of all tasks; empty: the goal [{UNIT}]"
+    )
 
     @model_serializer(mode="wrap")
-    def _without_no_sets(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        return {key: value for key, value in handler(self).items() if key != "keep_out" or value}
+    def _without_what_is_empty(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        empty = {"keep_out": not self.keep_out, "catch": not self.caught, "cost_center": not self.cost_center}
+        return {key: value for key, value in handler(self).items() if not empty.get(key)}
+
+    @property
+    def caught(self) -> bool:
+        """Whether the motion ends in a catch set, and no time follows."""
+        return bool(self.catch.half_widths)
 
     def problems(self) -> Iterator[Problem]:
         for i, limit in enumerate(self.state_limits):
@@ -164,7 +194,7 @@ class TaskChanges(Settings):
     """One of several tasks: what it has of its own; all else is as `task` says."""
 
     start: Numbers = Field(default=(), description=f"its first state; empty: that of `task` [{UNIT}]")
-    goal: Numbers = Field(default=(), description=f"its last state, an equilibrium; empty: that of `task` [{UNIT}]")
+    goal: Numbers = Field(default=(), description=f"its last state, as that of `task`; empty: the same [{UNIT}]")
     plant: dict[str, Arithmetic] = Field(
         default={},
         description="constants and design fields that differ in it: numbers, or arithmetic [their units]",
@@ -272,6 +302,18 @@ class PolicyConfig(Settings):
     discount: Annotated[Searchable, Option(0, 1000)] = Field(
         default=0.0, description="alpha: V falls as if A were A + alpha I [1/s]"
     )
+    catch_weight: Annotated[Searchable, Option(1e-9, 1e9, logarithmic=True)] = Field(
+        default=1.0, description="V on the boundary of the catch set, what a miss costs; with `task.catch` only [-]"
+    )
+
+    @model_serializer(mode="wrap")
+    def _without_usual_weight(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        return {key: value for key, value in handler(self).items() if key != "catch_weight" or self.weighs_catch}
+
+    @property
+    def weighs_catch(self) -> bool:
+        """Whether there is another `catch_weight` than by default."""
+        return self.catch_weight != type(self).model_fields["catch_weight"].default
 
     def variables(self) -> dict[str, Variable]:
         """Those of the options that are variables."""
@@ -282,8 +324,9 @@ class PolicyConfig(Settings):
         return any(getattr(item, "logarithmic", False) for item in type(self).model_fields[name].metadata)
 
     def initial(self) -> dict[str, float]:
-        """The options' numbers, a variable's initial one."""
-        return {name: option.initial if isinstance(option, Variable) else option for name, option in self}
+        """The options' numbers, a variable's initial one; a `catch_weight` only where it is not that by default."""
+        numbers = {name: option.initial if isinstance(option, Variable) else option for name, option in self}
+        return {name: number for name, number in numbers.items() if name != "catch_weight" or self.weighs_catch}
 
 
 Share = Annotated[float, Field(ge=0, lt=1)]

@@ -5,8 +5,9 @@ On [t_k, t_k+1] with s = (t - t_k) / (t_k+1 - t_k)
     u = clip(u_k - K(t) (x - x*(t))),  K(t) = (1 - s) K_k + s K_k+1,
     x*(t) the cubic Hermite interpolant of x_k, f(x_k, u_k) and x_k+1, f(x_k+1, u_k);
 
-after the last knot u = clip(-K_goal (x - x_goal)). The input is evaluated wherever the integrator asks for a slope:
-held over a step, it would lag the loop by half of it, and that is another loop than the promised one.
+after the last knot u = clip(-K_goal (x - x_goal)); a motion that ends in a catch set is over there. The input is
+evaluated wherever the integrator asks for a slope: held over a step, it would lag the loop by half of it, and that is
+another loop than the promised one.
 """
 
 import math
@@ -90,7 +91,8 @@ class ClosedLoop:
 @final
 @dataclass(frozen=True)
 class Outcome:
-    """Of every state: did it leave the funnel at a later knot, leave the limits at any step, miss the goal?
+    """Of every state: did it leave the funnel at a later knot, leave the limits at any step, miss the goal or the catch
+    set?
 
     Who enters a set to keep out of leaves the limits too.
     A state that left the limits is followed no further and has missed the goal too.
@@ -114,7 +116,7 @@ def simulate(
     settle: March | None = None,
 ) -> Outcome:
     """Follows every state from its knot's time to the last knot by `march`, then for the settling time by `settle`, or
-    by `march`, too.
+    by `march`, too; from a catch set no further.
 
     `f` are the dynamics that both integrate; here they give the slopes of x*(t) and the settling time.
     """
@@ -137,6 +139,9 @@ def simulate(
         level = elite.rho[k + 1] * (1 + LEVEL_TOLERANCE)
         left_funnel[moving] |= ~(elite.value(k + 1, x[moving]) <= level)
 
+    if elite.caught:
+        caught = elite.value_of_goal(x) <= elite.rho[-1] * (1 + LEVEL_TOLERANCE)
+        return Outcome(left_funnel, left_limits, left_limits | ~caught)
     arrived = ARRIVED * elite.rho[-1]
     interval = SETTLING_INTERVALS * (elite.time[-1] - elite.time[-2])
     for _ in range(math.ceil(settling_time(elite, f) / interval)):

@@ -172,6 +172,11 @@ class Elite:
         return sets_of(self.record.get("keep_out", ()), np.stack([self.x[0], self.x_goal]))
 
     @property
+    def caught(self) -> bool:
+        """Whether the motion ends in a catch set, the last ellipsoid: then nothing is said of the time after it."""
+        return "catch" in self.record
+
+    @property
     def design_units(self) -> Mapping[str, str]:
         """Of the design by name."""
         return self.record.get("units", {}).get("design", {})

@@ -6,8 +6,8 @@ On [t_k, t_k+1], s = (t - t_k) / (t_k+1 - t_k):
     S(t)     that of S_k and S_k+1 with the slopes of the policy's Riccati equation there, or a refinement's
     rho(t)   rho_k^(1 - s) rho_k+1^s
 
-After t_N the goal, its LQR's S_N, and rho_N. Errors x - x*(t) of angles are not wrapped. What was sampled is promised
-at the knots; between them this is the interpolation that proofs begin from.
+After t_N the goal, its LQR's S_N, and rho_N; with a catch set nothing is said there. Errors x - x*(t) of angles are not
+wrapped. What was sampled is promised at the knots; between them this is the interpolation that proofs begin from.
 """
 
 from dataclasses import dataclass

@@ -127,6 +127,14 @@ def require_one_task(path: Path) -> None:
         raise UserError(f"{path} is for several tasks: say which, {' or '.join(map(str, folders))}")
 
 
+def require_held_goal(path: Path, verb: str) -> None:
+    """Raises UserError if the motions of a run end in a catch set, after which `verb` would go on."""
+    if read_config(path).task.caught:
+        raise UserError(
+            f"{path} ends in a catch set (task.catch): rtcd {verb} needs a goal that is held after the motion"
+        )
+
+
 def task_of(path: Path) -> str:
     """The task whose folder this is, in a run for several; empty for a run of its own."""
     return str(_mark(path).get("task", ""))

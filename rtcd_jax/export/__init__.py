@@ -19,7 +19,7 @@ import numpy as np
 import yaml
 
 from rtcd_jax.certificate.standing import certificate_path
-from rtcd_jax.elite.records import elite_name
+from rtcd_jax.elite.records import elite_name, require_held_goal
 from rtcd_jax.export import robot, source, tables
 from rtcd_jax.export.bundle import Bundle, read_bundle
 from rtcd_jax.system.console import Console, each_second
@@ -38,9 +38,11 @@ def export_run(folder: Path, elite: int | str, target: Path, console: Console, l
     `label` names the controller's files and symbols, by default after robot and elite.
 
     Raises:
-        UserError: no run folder, no such elite, one without a funnel, or a target that holds something else.
+        UserError: no run folder, no such elite, one without a funnel or with a catch set, or a target that holds
+            something else.
     """
     former = _former(target)
+    require_held_goal(folder, "export")
     bundle = read_bundle(folder, elite_name(elite), label, each_second(console))
     contents = _files(folder, bundle)
     _require_ours(target, former, contents)

@@ -47,11 +47,15 @@ def understood(problem: Problem) -> Iterator[str]:
         if still and fastest > AT_REST:
             kind = f"an unstable equilibrium, from which motions grow by {fastest:.3g} 1/s"
         yield f"{name:10} {state.tolist()}: {kind}"
-    a, b = linearized_goal(problem)
-    blocks = [b]
-    for _ in range(plant.n - 1):
-        blocks.append(a @ blocks[-1] / max(1.0, float(np.linalg.norm(a))))
-    rank = np.linalg.matrix_rank(np.concatenate(blocks, axis=1))
-    yield f"control    the goal can be stabilized; {rank} of {plant.n} directions are controllable"
+    if problem.catch is None:
+        a, b = linearized_goal(problem)
+        blocks = [b]
+        for _ in range(plant.n - 1):
+            blocks.append(a @ blocks[-1] / max(1.0, float(np.linalg.norm(a))))
+        rank = np.linalg.matrix_rank(np.concatenate(blocks, axis=1))
+        yield f"control    the goal can be stabilized; {rank} of {plant.n} directions are controllable"
+    else:
+        within = problem.config.task.catch.in_words(problem.config.plant.states)
+        yield f"catch      the motion ends in an ellipsoid about the goal: {within}; nothing is asked after it"
     free = [variable.name for variable in problem.free]
     yield f"search     {len(free)} variables: {', '.join(free)}"

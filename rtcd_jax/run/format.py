@@ -105,6 +105,7 @@ def record_of(
         },
         "state_limits": [limit if np.isfinite(limit) else None for limit in problem.state_limits.tolist()],
         **({"keep_out": keep_out} if (keep_out := _keep_out(config)) else {}),
+        **({"catch": config.task.catch.model_dump()} if config.task.caught else {}),
         "status": Status(int(host.status)).name,
         "rung": "sampled",
         "epsilon": epsilon(funnel.trials, config.funnel.confidence, budget.rounds * candidates),

@@ -21,7 +21,16 @@ import jax.numpy as jnp
 import numpy as np
 
 from rtcd_jax.config.schema import SearchConfig
-from rtcd_jax.elite.records import Arrays, Record, read_config, read_elite, require_elites, task_of, write_elite
+from rtcd_jax.elite.records import (
+    Arrays,
+    Record,
+    read_config,
+    read_elite,
+    require_elites,
+    require_held_goal,
+    task_of,
+    write_elite,
+)
 from rtcd_jax.numerics.loops import on_gpu
 from rtcd_jax.problem import Problem, make_problem
 from rtcd_jax.refinement import AGREEMENT, Refinement, State
@@ -54,9 +63,10 @@ def refine_run(folder: Path, elites: int, free: tuple[str, ...], steps: int, con
 
     Raises:
         UserError: no run folder, a run without elites or one that is in use, a run for several tasks or for no volume,
-            or files that cannot be read or written.
+            one whose motions end in a catch set, or files that cannot be read or written.
     """
     config = read_config(folder)
+    require_held_goal(folder, "refine")
     if len(config.tasks) > 1 or task_of(folder):
         raise UserError(f"{folder} is for several tasks: an elite is refined for one, and would lose its place in them")
     if config.search.objective in OTHERS:

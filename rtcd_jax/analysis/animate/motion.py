@@ -29,7 +29,9 @@ class Motions:
 def motions(
     funnel: FunnelInterpolant, f: Dynamics, starts: Float[np.ndarray, "starts n"], time: Float[np.ndarray, " T"]
 ) -> Motions:
-    """The closed loop from `starts` at t = 0 on, after the last knot held by the goal's LQR; `time` is ascending."""
+    """The closed loop from `starts` at t = 0 on, after the last knot held by the goal's LQR, or standing still in the
+    catch set; `time` is ascending.
+    """
     elite = funnel.elite
     interval = float(np.min(np.diff(elite.time)))
     march = runge_kutta(f, min(interval / STEPS, STEP_OF_FASTEST / fastest_rate(elite, f)))
@@ -37,6 +39,8 @@ def motions(
     x, times, states = starts, [0.0], [starts]
     ends = [*elite.time, *np.arange(elite.time[-1] + interval, time[-1] + interval, interval)]
     for k, (begin, end) in enumerate(itertools.pairwise(ends)):
+        if k >= len(elite.u) and elite.caught:
+            break
         policy = loop.tracking(k) if k < len(elite.u) else loop.holding()
         passed = list(march(policy, begin, end, x))
         times += np.linspace(begin, end, len(passed) + 1)[1:].tolist()
@@ -48,7 +52,10 @@ def motions(
 
 
 def frame_times(elites: Sequence[Elite], hold: float, rate: float) -> Float[np.ndarray, " T"]:
-    """Frames of a video [s] that shows the longest motion and `hold` seconds after it, `rate` a second."""
+    """Frames of a video [s] that shows the longest motion and `hold` seconds after it, `rate` a second.
+
+    What ends in a catch set stands still there.
+    """
     longest = max(float(elite.time[-1]) for elite in elites)
     return np.arange(math.ceil((longest + hold) * rate) + 1) / rate
 

@@ -24,6 +24,7 @@ from rtcd_jax.analysis.disturb.experiments import (
 )
 from rtcd_jax.analysis.disturb.figures import draw_disturbance
 from rtcd_jax.analysis.disturb.scenarios import Outcome, Rollouts
+from rtcd_jax.elite.records import require_held_goal
 from rtcd_jax.system.console import Console
 from rtcd_jax.system.devices import require_devices
 from rtcd_jax.system.files import make_folder, replace_json
@@ -33,10 +34,11 @@ def disturb_run(folder: Path, states: int, seed: int, console: Console) -> None:
     """Runs all experiments; stores `disturbance/{off_nominal,impulse,push_margin,robustness}.json` and their figures.
 
     Raises:
-        UserError: no run folder, a run without elites, a folder that cannot be read or written, or other devices than
-            JAX_PLATFORMS or Slurm says.
+        UserError: no run folder, a run without elites, one whose motions end in a catch set, a folder that cannot be
+            read or written, or other devices than JAX_PLATFORMS or Slurm says.
     """
     require_devices()
+    require_held_goal(folder, "disturb")
     comparison = read_comparison(folder, console)
     place = folder / "disturbance"
     make_folder(place)

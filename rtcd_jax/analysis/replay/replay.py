@@ -5,6 +5,7 @@ happened in a longer one.
 """
 
 import csv
+import dataclasses
 import io
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -112,6 +113,8 @@ def replay_run(
     states, funnel = config.plant.states, FunnelInterpolant.of(elite)
     measured = read_measured(file, states, columns, start)
     _check_time(file, measured, float(elite.time[-1]))
+    if elite.caught:
+        measured = _until(measured, float(elite.time[-1]))
     if unwrap:
         measured = unwrapped(measured, states, funnel.nominal(measured.time[:1])[0])
     replay = Replay(measured, funnel.ratio(measured.time, measured.x), name, elite)
@@ -125,6 +128,17 @@ def replay_run(
         console.message(line)
     console.message(f"V/rho of every sample, and its figure: {results / stem}.csv, .json, .png, .pdf")
     return replay.held
+
+
+def _until(measured: Measured, end: float) -> Measured:
+    """What was measured up to the catch: of the time after it the funnel says nothing."""
+    before = measured.time <= end
+    if before.all():
+        return measured
+    note = f"{np.sum(~before)} samples after the catch at {end:.4g} s left out"
+    return dataclasses.replace(
+        measured, time=measured.time[before], x=measured.x[before], notes=(*measured.notes, note)
+    )
 
 
 def _check_time(file: Path, measured: Measured, end: float) -> None:

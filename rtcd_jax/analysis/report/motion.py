@@ -82,7 +82,8 @@ def boundary_ratio(elite: Elite) -> Float[np.ndarray, " knots"]:
 class Motions:
     """`STARTS` motions from the boundary of the first ellipsoid, and the nominal one as the first.
 
-    The times [s] are the knots and `stride` - 1 instants between two of them, and go on for `HOLD` seconds at the goal.
+    The times [s] are the knots and `stride` - 1 instants between two of them, and go on for `HOLD` seconds at the goal,
+    where that is held.
     `ratio` is V/rho at the knots; between them it repeats the last one.
     """
 
@@ -100,7 +101,7 @@ class Motions:
 
 @lru_cache(maxsize=16)
 def boundary_motions(elite: Elite) -> Motions:
-    """The closed loop from the boundary of the first ellipsoid, to the goal and held there.
+    """The closed loop from the boundary of the first ellipsoid, to the goal and held there, or into the catch set.
 
     Raises:
         UserError: an unknown plant, or the elite's parameters lack one.
@@ -114,7 +115,8 @@ def boundary_motions(elite: Elite) -> Motions:
     x = np.concatenate([elite.x[:1], elite.x[0] + y @ ellipsoid_axes(elite.S[0], elite.rho[0]).T])
     ratio = np.r_[0.0, np.ones(STARTS)]
     times, states, ratios = [elite.time[:1]], [x], [ratio]
-    ends = [*elite.time, *(elite.time[-1] + interval * np.arange(1, math.ceil(HOLD / interval) + 1))]
+    held = 0 if elite.caught else math.ceil(HOLD / interval)
+    ends = [*elite.time, *(elite.time[-1] + interval * np.arange(1, held + 1))]
     with np.errstate(all="ignore"):  # a motion far outside an external funnel may have no end; then there is a gap
         for k, (start, end) in enumerate(itertools.pairwise(ends)):
             policy = loop.tracking(k) if k < len(elite.u) else loop.holding()

@@ -151,6 +151,8 @@ def _header(runs: Sequence[Run]) -> str:
             _card(f"{run.name}: {name}", value, remark) for run in runs for name, value, remark in [_gained(run, "sum")]
         )
         candidate = ""
+    if first.task.caught:
+        about += f"; ends in a catch set: {first.task.catch.in_words(first.plant.states)}"
     names = " · ".join(html.escape(run.name) for run in runs)
     head = f'<h1>{names}</h1><p class="about">{html.escape(about)}</p>'
     return f'<header>{head}{candidate}<div class="cards">{cards}</div></header>'
@@ -164,7 +166,9 @@ def _headlines(run: Run) -> Iterator[tuple[str, str, str]]:
         yield of_the_best, value, f"{remark}, searched" if name == objective else remark
     yield "swing-up", duration(float(run.best.time[-1])), "of the best, start to goal"
     certificate = run.certificates.get("000")
-    if certificate is None:
+    if run.config.task.caught:
+        yield "proof", "none", "of a catch set"
+    elif certificate is None:
         yield "proof", "none yet", "rtcd certify"
     elif certificate.guarantee is None:
         yield "proof", "none", f"certificate {certificate.verdict}"
@@ -315,7 +319,8 @@ def _push_margin(run: Run, push: Mapping[str, float | None]) -> str:
 def _certified(runs: Sequence[Run]) -> Iterator[str]:
     certificates = tables.certificates(runs)
     if certificates is None:
-        yield note("Nothing yet: rtcd certify RUN.")
+        caught = all(run.config.task.caught for run in runs)
+        yield note("None: there is no proof of a catch set." if caught else "Nothing yet: rtcd certify RUN.")
         return
     yield table(certificates)
     for run in runs:

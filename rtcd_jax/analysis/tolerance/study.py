@@ -18,7 +18,7 @@ from rtcd_jax.analysis.tolerance.factors import MOST, PRECISE, is_open, largest_
 from rtcd_jax.analysis.tolerance.figures import draw_tolerance
 from rtcd_jax.analysis.tolerance.proved import proved_factor
 from rtcd_jax.elite.elite import Elite
-from rtcd_jax.elite.records import elite_name, read_config
+from rtcd_jax.elite.records import elite_name, read_config, require_held_goal
 from rtcd_jax.evaluation import elite_key, search_budget
 from rtcd_jax.funnel import estimate_funnel
 from rtcd_jax.plants import plant_of
@@ -45,6 +45,8 @@ def tolerance_run(folder: Path, which: int | str, file: Path | None, console: Co
             cannot be written.
     """
     elite = Elite.read(folder, which)
+    if prove:
+        require_held_goal(folder, "tolerance --prove")
     problem = make_problem(with_box(read_config(folder), file))
     make_folder(folder / FOLDER)
     boxes = sides(problem)

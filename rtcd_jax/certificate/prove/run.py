@@ -18,7 +18,7 @@ from rtcd_jax.certificate.prove.closed_loop import claim_of
 from rtcd_jax.certificate.prove.sdp import SOLVER, require_solver
 from rtcd_jax.certificate.prove.uncertainty import bounds_of, uncertainty_of
 from rtcd_jax.elite.elite import Elite
-from rtcd_jax.elite.records import require_elites
+from rtcd_jax.elite.records import require_elites, require_held_goal
 from rtcd_jax.system.console import Clock, Console, Progress, table, times
 from rtcd_jax.system.errors import UserError
 from rtcd_jax.system.files import in_turn, make_folder, read_json, replace_json
@@ -90,6 +90,7 @@ def certify_run(
     """
     if solver != SOLVER:
         solver = require_solver(solver)
+    require_held_goal(folder, "certify")
     names = require_elites(folder)[:elites] if only is None else [only]
     for name in names:  # at once, and not from a worker
         elite = Elite.read(folder, name)
