@@ -9,6 +9,7 @@ CONFIGS = Path(__file__).parents[2] / "configs"
 ROBOTS = {
     "pendulum": "pendulum_rtcd", "cartpole": "cartpole_rtcd", "acrobot": "acrobot", "pendubot": "pendubot",
     "furuta": "furuta", "reaction_wheel": "reaction_wheel", "double_cartpole": "double_cartpole",
+    "acromonk": "acromonk",
 }  # fmt: skip
 """Configurations by the robots' names."""
 
