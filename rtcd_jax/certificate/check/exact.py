@@ -16,6 +16,8 @@ MAX_ORDER = 16
 """Of polynomials: no file may ask for more."""
 MAX_TERMS = 6000
 """Of a Taylor model: a product of two takes two seconds then. The cart-pole's goal region has 2142."""
+MAX_FURTHER = 32
+"""Of the monomials of a sum of squares, beside those up to its degree."""
 MAX_BYTES = 1 << 27
 """Of a file; the cart-pole's have up to 5e7."""
 PI = Q(314159265358979323846264338327950288419716939937510, 10**50)

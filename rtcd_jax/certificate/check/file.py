@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 from rtcd_jax.certificate.check.claim import Claim
 from rtcd_jax.certificate.check.exact import (
     MAX_BYTES,
+    MAX_FURTHER,
     MAX_ORDER,
     MAX_TERMS,
     Damaged,
@@ -303,10 +304,11 @@ def read_cases(node: Node, n: int) -> dict[str, GramCertificate]:
     cases = {}
     for case, value in node.value.items():
         here = Node(f"{node.place}.{case}", value)
-        holds = isinstance(value, dict) and value.keys() == {"degree", "gram", "multipliers"}
-        here.require(holds, "must have the keys degree, gram, multipliers")
+        holds = isinstance(value, dict) and value.keys() - {"further"} == {"degree", "gram", "multipliers"}
+        here.require(holds, "must have the keys degree, gram, multipliers, and may have further")
         degree = Node(f"{here.place}.degree", value["degree"]).integer(1, MAX_ORDER // 2)
-        rows, sides = len(monomials(n, degree)), len(monomials(n, degree - 1))
+        further = _read_monomials(Node(f"{here.place}.further", value["further"]), n) if "further" in value else ()
+        rows, sides = len(monomials(n, degree)) + len(further), len(monomials(n, degree - 1))
         grams = Node(f"{here.place}.gram", value["gram"]).items(at_least=1)
         grams[0].require(len(grams) <= 2 * MAX_ORDER, f"must have at most {2 * MAX_ORDER} matrices")
         multipliers = Node(f"{here.place}.multipliers", value["multipliers"]).items()
@@ -314,8 +316,15 @@ def read_cases(node: Node, n: int) -> dict[str, GramCertificate]:
             degree,
             [gram.symmetric(rows) for gram in grams],
             [[matrix.symmetric(sides) for matrix in each.items(at_least=1)] for each in multipliers],
+            further,
         )
     return cases
+
+
+def _read_monomials(node: Node, n: int) -> tuple[tuple[int, ...], ...]:
+    items = node.items(at_least=1)
+    node.require(len(items) <= MAX_FURTHER, f"must have at most {MAX_FURTHER} monomials")
+    return tuple(tuple(power.integer(0, MAX_ORDER // 2) for power in each.items(n)) for each in items)
 
 
 def require_few_terms(node: Node, n: int, s_order: int, y_order: int) -> None:

@@ -28,12 +28,13 @@ class Obligation(NamedTuple):
 class GramCertificate(NamedTuple):
     """`gram` [j] and `multipliers` [i][a], symmetric matrices: the G_j and S_ia of the theorem's proof.
 
-    Their monomials of y go up to `degree` and `degree` - 1.
+    Their monomials of y go up to `degree` and `degree` - 1; those of G_j are followed by the `further` ones.
     """
 
     degree: int
     gram: list
     multipliers: list
+    further: tuple[tuple[int, ...], ...] = ()
 
 
 @lru_cache(None)
@@ -121,7 +122,7 @@ def margin(todo: Obligation, certificate: GramCertificate, place: str):
         Refused: the certificate does not show that.
     """
     n = len(next(iter(todo.p.to_dict()), (0, 0))) - 1
-    basis, sides = monomials(n, certificate.degree), monomials(n, certificate.degree - 1)
+    basis, sides = (*monomials(n, certificate.degree), *certificate.further), monomials(n, certificate.degree - 1)
     degree = len(certificate.gram) - 1
     parts = bernstein(todo.p, degree, todo.low, todo.high, place)
     require(len(certificate.multipliers) == len(todo.where), place, f"needs {len(todo.where)} multipliers")

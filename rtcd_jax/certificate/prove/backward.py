@@ -2,8 +2,8 @@
 
 On an interval the level follows the fastest growth of V, found on sampled directions, plus a decay margin: a rate that
 the level gives away so that V falls strictly. The limits on the states cap the level. The semidefinite program then
-only verifies. Where it fails, the decay margin is raised, then the interval halved, then the margin raised again. Where
-it leaves much more than it needs, the interval is proved once more with a lower decay margin.
+only verifies. Where it fails, the decay margin is raised, then the interval halved, and so on. Where it leaves much more
+than it needs, the interval is proved once more with a lower decay margin.
 """
 
 from collections.abc import Iterator
@@ -15,22 +15,47 @@ from rtcd_jax.certificate import check
 from rtcd_jax.certificate.check import Claim, GramCertificate, Interval, Obligation, Refused
 from rtcd_jax.certificate.prove import sdp as program
 from rtcd_jax.certificate.prove.closed_loop import Loop, on_grid
-from rtcd_jax.certificate.prove.levels import carried_back, unit_directions
+from rtcd_jax.certificate.prove.levels import followed, unit_directions
+from rtcd_jax.certificate.prove.sdp import Shape
 
-DECAY_MARGINS = {2: (0.005, 0.015, 0.04, 0.1), 4: (0.02, 0.06, 0.2, 0.5)}
-"""By the number of states: decay margins [1/s] in the order of trial, before an interval is halved."""
-LARGE_DECAY_MARGINS = (0.25, 0.6, 1.5, 4.0, 10.0, 25.0)
-"""Further ones for an interval of the shortest length."""
+DECAY_MARGINS = {
+    2: (0.005, 0.015, 0.04, 0.1, 0.25, 0.6, 1.5, 4.0, 10.0, 25.0),
+    4: (0.02, 0.05, 0.1, 0.2, 0.5, 1.5, 4.0, 10.0, 25.0),
+}
+"""By the number of states: decay margins [1/s] in the order of trial."""
+LARGEST = {2: 0.1, 4: 0.06}
+"""Decay margin [1/s] beyond which an interval is halved rather; of a part, over its length. The shortest have all."""
 RECLAIMED = 0.8
 """Share of the certificates' margin by which the decay margin is lowered."""
 WASTED = 1 / 4
 """Share of the decay margin beyond which the certificates' margin is worth a second attempt."""
+LOW = 1 / 3
+"""Share of that up to which a decay margin is low: the next interval is twice as long."""
 SHORTEST = 1 / 16
 """Shortest fraction of the knots' interval."""
-TIME_ORDER, MULTIPLIER = 5, 1
-"""Orders in s of Taylor models and of multipliers; u_lin has order 4 (K times L), so that all fit into degree 5."""
-TIERS = {2: ((5, 3), (7, 4), (9, 5), (11, 6)), 4: ((3, 2), (5, 3))}
-"""By the number of states: orders in y of Taylor models and degrees of monomials, the cheapest first."""
+FEWEST = 2
+"""Least degree of the squares' monomials: a case with a margin above the decay margin needs no more."""
+MULTIPLIER = 1
+"""Order in s of multipliers."""
+
+
+class Tier(NamedTuple):
+    """Orders in s and y of Taylor models, the degree of the squares' monomials, and whether they have further ones.
+
+    u_lin has order 4 in s (K times L), so that all fit into Bernstein polynomials of the order in s.
+    """
+
+    time_order: int
+    order: int
+    degree: int
+    further: bool = False
+
+
+TIERS = {
+    2: (Tier(5, 5, 3), Tier(5, 7, 4), Tier(5, 9, 5), Tier(5, 11, 6)),
+    4: (Tier(5, 3, 2), Tier(5, 5, 3), Tier(7, 8, 3, True)),
+}
+"""By the number of states, the cheapest first."""
 ERROR_FRACTION = 1 / 3
 """A Taylor model is good enough if its error is at most this fraction of the decay margin."""
 
@@ -43,11 +68,16 @@ class Proved(NamedTuple):
     decay_margin: float
     margin: float
 
+    @property
+    def length(self) -> float:
+        """As a fraction of the knots' interval."""
+        return float(self.interval.end - self.interval.start)
+
 
 class ProofState(NamedTuple):
     """How far the proof has come: a fraction of an interval, the level and the ellipsoid there.
 
-    `first_margin` [1/s] is the decay margin that the next interval begins with.
+    `first_margin` [1/s] is the decay margin that the next interval begins with, and `length` its fraction.
     """
 
     knot: int
@@ -55,6 +85,7 @@ class ProofState(NamedTuple):
     rho: float
     axes: list
     first_margin: float
+    length: float
 
 
 @final
@@ -68,39 +99,39 @@ class BackwardProof:
     def outlet(self, rho: float) -> ProofState:
         """The state at which the proof begins: t_N with the level rho."""
         last = len(self.loop.u) - 1
-        return ProofState(last, 1.0, rho, on_grid(self.loop.axes(last, 1.0, rho, 0.0)[0]), self._rates[0])
+        return ProofState(last, 1.0, rho, on_grid(self.loop.axes(last, 1.0, rho, 0.0)[0]), self._rates[0], 1.0)
 
     def intervals_from(self, state: ProofState) -> Iterator[Proved]:
         """The proved intervals from the state back to t = 0, or to where nothing can be proved."""
-        waiting = [(k, 0.0, 1.0) for k in range(state.knot)]
-        waiting += [(state.knot, 0.0, state.fraction)] if state.fraction > 0 else []
-        while waiting:
-            k, start, end = waiting.pop()
-            short = end - start <= SHORTEST
-            proved = self._least_margin(k, start, end, state, short)
-            if proved is None and short:
-                return
-            if proved is None:
-                middle = (start + end) / 2
-                waiting += [(k, start, middle), (k, middle, end)]
-                continue
-            first_margin = self.first_margin(proved.decay_margin, proved.margin)
-            state = ProofState(k, start, proved.rho, proved.interval.first, first_margin)
+        while state.knot or state.fraction:
+            k, end = (state.knot, state.fraction) if state.fraction else (state.knot - 1, 1.0)
+            length = state.length
+            while end % length:
+                length /= 2
+            while (proved := self._least_margin(k, end - length, end, state)) is None:
+                if length <= SHORTEST:
+                    return
+                length /= 2
+            state = self.after(proved)
             yield proved
 
-    def first_margin(self, decay_margin: float, margin: float) -> float:
-        """The decay margin that the interval begins with which comes behind one of these margins."""
-        return min(self._lowered(decay_margin, margin), self._rates[-1])
+    def after(self, proved: Proved) -> ProofState:
+        """The state behind a proved interval. Where a low decay margin was enough, the next one is longer."""
+        k, start, length = proved.interval.knot, float(proved.interval.start), proved.length
+        longer = min(1.0, 2 * length) if proved.decay_margin <= LOW * LARGEST[self.claim.n] else length
+        first_margin = min(self._lowered(proved.decay_margin, proved.margin), LARGEST[self.claim.n] / longer)
+        return ProofState(k, start, proved.rho, proved.interval.first, first_margin, longer)
 
     def _lowered(self, decay_margin: float, margin: float) -> float:
         """A decay margin that the certificates' margin still allows, if that is much; the same if not."""
         wasted = margin > max(WASTED * decay_margin, self._rates[0])
         return max(self._rates[0], decay_margin - RECLAIMED * margin) if wasted else decay_margin
 
-    def _least_margin(self, k: int, start: float, end: float, state: ProofState, short: bool) -> Proved | None:
+    def _least_margin(self, k: int, start: float, end: float, state: ProofState) -> Proved | None:
         """The interval with nearly the least decay margin with which it can be proved."""
-        rates = self._rates + (LARGE_DECAY_MARGINS if short else ())
-        for rate in (state.first_margin, *(rate for rate in rates if rate > state.first_margin)):
+        length, first = end - start, state.first_margin
+        largest = LARGEST[self.claim.n] / length if length > SHORTEST else np.inf
+        for rate in (first, *(rate for rate in self._rates if first < rate <= largest)):
             proved = self._attempt(k, start, end, state, rate)
             if proved is not None:
                 lower = self._lowered(rate, proved.margin)
@@ -116,8 +147,8 @@ class BackwardProof:
             check.require_kept_out(self.claim, interval, data, "sets")
             if self.claim.first_order:
                 check.require_jump(self.claim, interval, "jumps")
-            interval, todo, degree = self._models(interval, decay_margin)
-            proof = prove(todo, degree, interval.orders[0], self.exact, self._directions, self.solver)
+            interval, todo, shapes = self._models(interval, decay_margin)
+            proof = prove(todo, shapes, decay_margin, self.exact, self._directions, self.solver)
         except Refused:
             return None
         if proof is None:
@@ -130,52 +161,79 @@ class BackwardProof:
     ) -> tuple[Interval, float]:
         """The interval's ellipsoids, from the state's level and the decay margin; Refused if the level vanishes."""
         loop, half = self.loop, (end - start) * self.loop.dt / 2
-        rho, first_growth, last_growth = carried_back(loop, k, start, end, state.rho, decay_margin, self._directions)
-        a, a_rate = loop.axes(k, start, rho, first_growth)
-        b, b_rate = loop.axes(k, end, state.rho, last_growth)
+        rho, (a, a_rate, b, b_rate) = followed(loop, k, start, end, state.rho, decay_margin, self._directions)
         chord = (b - a) / 2
         at_start, at_end = (a_rate * half - chord) / 2, (chord - b_rate * half) / 2
         bend = [on_grid((at_end + at_start) / 2), on_grid((at_end - at_start) / 2)]
         fractions = check.rational(start), check.rational(end)
-        order = TIERS[self.claim.n][0][0]
         late = loop.late_rows(k, start, end) if self.claim.first_order else []
         sides = loop.sides(k, start, end)
-        return Interval(k, *fractions, on_grid(a), state.axes, bend, (TIME_ORDER, order), {}, late, sides), rho
+        return Interval(k, *fractions, on_grid(a), state.axes, bend, TIERS[self.claim.n][0][:2], {}, late, sides), rho
 
-    def _models(self, interval: Interval, decay_margin: float) -> tuple[Interval, dict[str, Obligation], int]:
-        """The interval's obligations by the cheapest Taylor models that are good enough."""
-        *cheaper, (order, degree) = TIERS[self.claim.n]
-        for order_here, degree_here in cheaper:
-            attempt = interval._replace(orders=(TIME_ORDER, order_here))
-            todo = check.funnel_obligations(self.claim, attempt, "interval")
+    def _models(
+        self, interval: Interval, decay_margin: float
+    ) -> tuple[Interval, dict[str, Obligation], dict[str, list[Shape]]]:
+        """The interval's obligations by the cheapest Taylor models that are good enough, and the shapes of their
+        programs, the cheapest first.
+        """
+        *cheaper, last = TIERS[self.claim.n]
+        for tier in (*cheaper, last):
+            interval = interval._replace(orders=(tier.time_order, tier.order))
+            todo = check.funnel_obligations(self.claim, interval, "interval")
             if max(float(each.error) for each in todo.values()) <= ERROR_FRACTION * decay_margin:
-                return attempt, todo, degree_here
-        interval = interval._replace(orders=(TIME_ORDER, order))
-        return interval, check.funnel_obligations(self.claim, interval, "interval"), degree
+                break
+        sizes = [(degree, ()) for degree in range(FEWEST, tier.degree + tier.further)]
+        sizes.append((tier.degree, self._of_the_angles(tier.degree) if tier.further else ()))
+        shapes = {
+            case: [program.shape_of(each, degree, tier.time_order, MULTIPLIER if each.where else 0, further)
+                   for degree, further in sizes]
+            for case, each in todo.items()
+        }  # fmt: skip
+        return interval, todo, shapes
+
+    def _of_the_angles(self, degree: int) -> program.Monomials:
+        """The monomials of the next degree, but for one power at most, in those y by which the angles are."""
+        angles = len(self.loop.hinges)
+        return tuple(
+            e for e in check.monomials(self.claim.n, degree + 1) if sum(e) > degree and sum(e[:angles]) >= degree
+        )
 
 
 def prove(
-    todo: dict[str, Obligation], degree: int, order: int, exact: bool, directions: np.ndarray, solver: str
+    todo: dict[str, Obligation],
+    shapes: dict[str, list[Shape]],
+    enough: float,
+    exact: bool,
+    directions: np.ndarray,
+    solver: str,
 ) -> tuple[dict[str, GramCertificate], float] | None:
     """Gram certificates by case and the least margin; None where a case has none. `exact`: the checker's margin.
 
-    The `directions` [n D] are tried before a program is solved.
+    A case is shown by the first of its shapes with a margin of `enough`, or else by the last. The `directions` [n D]
+    are tried before a program is solved.
 
     Raises:
         Refused: the checker does not accept a certificate of the solver's.
     """
-    certificates, least = {}, np.inf
-    shapes = {
-        case: program.shape_of(each, degree, order, MULTIPLIER if each.where else 0) for case, each in todo.items()
-    }
-    data = {case: program.data_of(each, shapes[case]) for case, each in todo.items()}
-    if any(program.lowest(data[case], shapes[case], directions) <= 0 for case in todo):
+
+    def lowest(case: str, shape: Shape) -> float:
+        return program.lowest(program.data_of(todo[case], shape), shape, directions)
+
+    hardest = {case: lowest(case, shapes[case][-1]) for case in todo}
+    if min(hardest.values()) <= 0:
         return None
-    for case, each in todo.items():
-        solution = program.solve(data[case], shapes[case], solver)
+    certificates, least = {}, np.inf
+    for case in sorted(todo, key=hardest.__getitem__):
+        solution = None
+        for shape in shapes[case]:
+            needed = 0 if shape is shapes[case][-1] else enough
+            if lowest(case, shape) > needed:
+                solution = program.solve(program.data_of(todo[case], shape), shape, solver)
+                if solution is not None and solution.margin > needed:
+                    break
         if solution is None:
             return None
         certificates[case] = solution.certificate
-        margin = float(cast(Any, check.margin(each, solution.certificate, case))) if exact else solution.margin
+        margin = float(cast(Any, check.margin(todo[case], solution.certificate, case))) if exact else solution.margin
         least = min(least, margin)
-    return certificates, least
+    return {case: certificates[case] for case in todo}, least

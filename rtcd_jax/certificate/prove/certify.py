@@ -4,6 +4,7 @@ import contextlib
 import hashlib
 import json
 import math
+import re
 import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -15,7 +16,7 @@ from rtcd_jax.certificate import check
 from rtcd_jax.certificate.check import Claim, GramCertificate, Node, Refused
 from rtcd_jax.certificate.enlarge import all_knots as joint
 from rtcd_jax.certificate.enlarge import knot_by_knot as backward
-from rtcd_jax.certificate.prove.backward import BackwardProof, ProofState
+from rtcd_jax.certificate.prove.backward import BackwardProof, Proved, ProofState
 from rtcd_jax.certificate.prove.closed_loop import Loop, claim_of, double, doubles, with_digests
 from rtcd_jax.certificate.prove.goal import GoalRegion, goal_region
 from rtcd_jax.certificate.prove.levels import leveled, unit_directions
@@ -55,6 +56,9 @@ class Checking(NamedTuple):
     elite: str
     done: int
     of: int
+
+
+_ZEROS = re.compile(r"\.?0*p")
 
 
 class Outcome(NamedTuple):
@@ -263,8 +267,7 @@ def _resumed(proof: BackwardProof, claim: Claim, outlet: float, journal: Journal
     for line in journal.lines:
         if "stretch" in line:
             interval = check.read_interval(Node("journal", line["stretch"]), claim)
-            first_margin = proof.first_margin(line["spare"], line["margin"])
-            state = ProofState(interval.knot, float(interval.start), line["rho"], interval.first, first_margin)
+            state = proof.after(Proved(interval, line["rho"], line["spare"], line["margin"]))
     return state
 
 
@@ -309,6 +312,7 @@ def _cases_record(cases: Mapping[str, GramCertificate]) -> dict[str, Any]:
             "degree": certificate.degree,
             "gram": [_triangle(matrix) for matrix in certificate.gram],
             "multipliers": [[_triangle(matrix) for matrix in each] for each in certificate.multipliers],
+            **({"further": [list(each) for each in certificate.further]} if certificate.further else {}),
         }
         for case, certificate in cases.items()
     }
@@ -319,4 +323,5 @@ def _matrix(matrix: list[list]) -> Any:
 
 
 def _triangle(matrix: list[list]) -> list[str]:
-    return [double(float(c)) for i, row in enumerate(matrix) for c in row[i:]]
+    """Without the zeros that end most numbers on the grid: these are most of a file."""
+    return [_ZEROS.sub("p", double(float(c))) for i, row in enumerate(matrix) for c in row[i:]]

@@ -309,17 +309,22 @@ class Loop:
 
     def growth(self, k: int, fraction: float, rho: float, directions: np.ndarray) -> float:
         """The largest V' / V over the surface V = rho, searched from the sampled directions [n D]."""
-        s, slope = self.value(k, fraction)
-        axes, _ = self.axes(k, fraction, rho, 0.0)
+        return 2 * self.rise(k, fraction, *self.axes(k, fraction, rho, 0.0), directions)
+
+    def rise(self, k: int, fraction: float, axes: np.ndarray, axes_rate: np.ndarray, directions: np.ndarray) -> float:
+        """The largest |y|' over |y| = 1, where x = x* + L y, of all robots and inputs; searched from the sampled
+        directions [n D].
+        """
         center, center_rate = self.nominal(k, fraction)
         gain = (1 - fraction) * self.gains[k] + fraction * self.gains[k + 1]
+        inverse = np.linalg.inv(axes)
 
         def rises(y: np.ndarray) -> np.ndarray:
-            error = axes @ y
+            error, weight = axes @ y, inverse.T @ y
             asked = self.u[k] - gain @ error
             oldest = asked + self.age * self.late_row(k, fraction) @ error if self.claim.first_order else asked
-            worst = self._fastest(center[:, None] + error, s @ error, (asked, oldest), self.late[k])
-            return (2 * (worst - center_rate @ (s @ error)) + np.sum(error * (slope @ error), axis=0)) / rho
+            worst = self._fastest(center[:, None] + error, weight, (asked, oldest), self.late[k])
+            return worst - center_rate @ weight - np.sum(weight * (axes_rate @ y), axis=0)
 
         return _highest(rises, directions)
 

@@ -6,10 +6,10 @@ import numpy as np
 
 from rtcd_jax.certificate import check
 from rtcd_jax.certificate.check import Claim, Refused, Shell
-from rtcd_jax.certificate.prove.backward import prove
+from rtcd_jax.certificate.prove.backward import MULTIPLIER, prove
 from rtcd_jax.certificate.prove.closed_loop import Loop, on_grid
 from rtcd_jax.certificate.prove.levels import goal_level, unit_directions
-from rtcd_jax.certificate.prove.sdp import SOLVER
+from rtcd_jax.certificate.prove.sdp import SOLVER, shape_of
 
 LEVEL_FRACTIONS = (1.0, 0.995, 0.985, 0.97, 0.95, 0.92, 0.88, 0.83, 0.77, 0.7, 0.6, 0.5, 0.35, 0.2, 0.1)
 """Fractions of the level that the samples allow, in the order of trial."""
@@ -67,7 +67,11 @@ def _at_level(
             proof = None
             if start or not claim.moves_the_goal:
                 todo = check.goal_obligations(claim, field, *ends)
-                proof = prove(todo, degree, order + 1, exact, directions, solver)
+                shapes = {
+                    case: [shape_of(each, degree, order + 1, MULTIPLIER if each.where else 0)]
+                    for case, each in todo.items()
+                }
+                proof = prove(todo, shapes, 0.0, exact, directions, solver)
             if proof is not None:
                 shells.append(Shell(*ends, proof[0]))
                 least = min(least, proof[1])

@@ -3,6 +3,7 @@
 from typing import NamedTuple
 
 import numpy as np
+from scipy.optimize import linprog
 
 from rtcd_jax.certificate.check import Refused, require
 from rtcd_jax.certificate.prove.closed_loop import Loop, hermite
@@ -19,6 +20,10 @@ BOX_FRACTION = 0.999
 FRACTION_OF_LIMIT = 0.99
 """Fraction of the clearance to a limit that ellipsoids of free shape may fill."""
 DIRECTION_COUNTS = {2: 720, 4: 4000}
+ROUNDS = 3
+"""Linear programs by which the level of an interval that is proved follows the growth of V."""
+INSTANTS = np.linspace(0, 1, 7)
+"""Fractions of such an interval at which the growth is sampled."""
 DECAY_MARGIN = 0.02
 """Decay margin [1/s] of funnels that are not proved yet."""
 FRACTIONS = np.linspace(0, 1, 5)
@@ -33,6 +38,24 @@ class Carried(NamedTuple):
     rho: float
     first: float
     last: float
+
+
+class Course(NamedTuple):
+    """The ellipsoids of an interval: L and L' [n n] at its start and end. In between L is the cubic of these."""
+
+    first: np.ndarray
+    first_rate: np.ndarray
+    last: np.ndarray
+    last_rate: np.ndarray
+
+    def at(self, fraction: float, duration: float) -> tuple[np.ndarray, np.ndarray]:
+        """L and L'."""
+        return hermite(fraction, duration, self.first, self.first_rate, self.last, self.last_rate)
+
+    def scaled(self, by: float, first_growth: float, last_growth: float) -> "Course":
+        """With `by` times the first ellipsoid, and both ends growing faster by rates [1/s]."""
+        first_rate = by * (self.first_rate + first_growth * self.first)
+        return Course(by * self.first, first_rate, self.last, self.last_rate + last_growth * self.last)
 
 
 def unit_directions(n: int) -> np.ndarray:
@@ -109,6 +132,41 @@ def carried_back(
         both = float(np.log(held / cap) / ((end - start) * loop.dt))
         return Carried(cap, both, both)
     return Carried(float(rho), slope, last)
+
+
+def followed(
+    loop: Loop, k: int, start: float, end: float, rho: float, decay_margin: float, directions: np.ndarray
+) -> tuple[float, Course]:
+    """The largest level at the start from which a cubic L leads to rho at the end, and that L: |y| falls by half the
+    decay margin or faster at all sampled instants.
+
+    The cubic of `carried_back` follows V's growth at both ends alone. It is scaled by exp(c(t)), c(end) = 0, with a
+    quadratic c' no smaller than what is missing, of which a linear program finds the one with the least integral.
+
+    Raises:
+        Refused: the level vanishes.
+    """
+    duration = (end - start) * loop.dt
+    carried = carried_back(loop, k, start, end, rho, decay_margin, directions)
+    first, last = loop.axes(k, start, carried.rho, carried.first), loop.axes(k, end, rho, carried.last)
+    level, course = carried.rho, Course(*first, *last)
+    cap = BOX_FRACTION * loop.box_level(k, start)
+    powers = np.stack([np.ones_like(INSTANTS), INSTANTS, INSTANTS**2], axis=1)
+    integral = np.array([1, 1 / 2, 1 / 3]) * duration
+    for _ in range(ROUNDS):
+        missing = decay_margin / 2 + np.array(
+            [loop.rise(k, start + t * (end - start), *course.at(t, duration), directions) for t in INSTANTS]
+        )
+        room = np.log(cap / level) / 2
+        solution = linprog(
+            integral, -np.vstack([powers, integral]), -np.append(missing, -room), bounds=(None, None)
+        )
+        require(solution.status == 0, "interval", "no cubic level follows the growth of V")
+        c_rate = solution.x
+        by = np.exp(-integral @ c_rate)
+        level *= by**2
+        course = course.scaled(by, c_rate[0], c_rate.sum())
+    return float(level), course
 
 
 def leveled(loop: Loop, directions: np.ndarray) -> Loop:

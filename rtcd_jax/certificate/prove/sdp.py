@@ -6,7 +6,8 @@ maximize t  such that, for every Bernstein index j and modulo |y|^2 = 1,
     sigma_i = sum_a B_a(s) z'S_ia z,    S_ia >= 0
 
 (check has the theorem). The time s stays outside the Gram matrices, and the sphere makes them small: with monomials
-up to degree 3, 7 rows for two states and 30 for four. cvxpy states the program once a shape, with p and g as its
+up to degree 3, 7 rows for two states and 30 for four. A polynomial of higher degree is one in the angles nearly: a few
+`further` monomials of z hold it. What no product of theirs has counts as error. cvxpy states the program once a shape, with p and g as its
 parameters, and hands it to any solver that is installed: the exact checker decides what a solution is worth.
 """
 
@@ -37,21 +38,33 @@ OPTIONS: dict[str, dict[str, Any]] = {
     "SCS": {"eps_abs": 1e-7, "eps_rel": 1e-7, "max_iters": 20_000},
 }  # fmt: skip
 """Of solvers whose own tolerances leave margins of thousandths no room."""
-GRID = 44
-"""Gram certificates are rounded to multiples of 2^-44, so that the checker's integers stay short."""
-LIFT = 2.0**-36
+GRID = 30
+"""Gram certificates are rounded to multiples of 2^-30, so that files and the checker's integers stay short."""
+LIFT = 2.0**-24
 """Added to every diagonal: the solver's matrices are positive definite up to its tolerance only."""
 SAMPLED_TIMES = 7
 
 
+Monomials = tuple[tuple[int, ...], ...]
+"""Exponents of y."""
+
+
 class Shape(NamedTuple):
-    """Sizes of a program: states, degree of z, Bernstein degrees of the whole and of the multipliers, constraints."""
+    """Sizes of a program: states, degree of z, Bernstein degrees of the whole and of the multipliers, constraints; and
+    the monomials of z beyond its degree.
+    """
 
     n: int
     degree: int
     bernstein: int
     multiplier: int
     constraints: int
+    further: Monomials = ()
+
+    @property
+    def basis(self) -> Monomials:
+        """z."""
+        return (*check.monomials(self.n, self.degree), *self.further)
 
 
 class Data(NamedTuple):
@@ -71,30 +84,40 @@ class Solution:
 
 
 @lru_cache(None)
-def _index(n: int, degree: int) -> dict[tuple[int, ...], int]:
-    return {e: i for i, e in enumerate(check.monomials(n, degree))}
+def _products(basis: Monomials, degree: int) -> Monomials:
+    """All monomials up to the degree, then those beyond that products of the basis have on the sphere."""
+    n = len(basis[0])
+    pairs = itertools.combinations_with_replacement(basis, 2)
+    found = {e for pair in pairs for e, _ in check.reduced(tuple(map(sum, zip(*pair, strict=True))))}
+    usual = check.monomials(n, degree)
+    return (*usual, *sorted(found - set(usual)))
 
 
 @lru_cache(None)
-def _product_map(n: int, degree: int, side: int) -> sp.csc_matrix:
-    """Coefficients of (z'G z) m on the sphere, from the entries of G, row by row: those of the first monomial m up to
-    the degree `side`, then those of the next one.
+def _index(monomials: Monomials) -> dict[tuple[int, ...], int]:
+    return {e: i for i, e in enumerate(monomials)}
+
+
+@lru_cache(None)
+def _product_map(basis: Monomials, products: Monomials, side: int) -> sp.csc_matrix:
+    """Coefficients, by `products`, of (z'G z) m on the sphere, from the entries of G, row by row: those of the first
+    monomial m up to the degree `side`, then those of the next one.
     """
-    basis, index = check.monomials(n, degree), _index(n, 2 * degree + 2 * side)
+    index = _index(products)
     rows, columns, values = [], [], []
-    for block, m in enumerate(check.monomials(n, side)):
+    for block, m in enumerate(check.monomials(len(basis[0]), side)):
         for column, (first, second) in enumerate(itertools.product(basis, basis)):
             for e, k in check.reduced(tuple(map(sum, zip(first, second, m, strict=True)))):
                 rows.append(block * len(index) + index[e])
                 columns.append(column)
                 values.append(k)
-    shape = len(check.monomials(n, side)) * len(index), len(basis) ** 2
+    shape = len(check.monomials(len(basis[0]), side)) * len(index), len(basis) ** 2
     return sp.csc_matrix((np.array(values, float), (rows, columns)), shape=shape)
 
 
-def shape_of(todo: Obligation, degree: int, bernstein: int, multiplier: int) -> Shape:
+def shape_of(todo: Obligation, degree: int, bernstein: int, multiplier: int, further: Monomials = ()) -> Shape:
     n = len(next(iter(check.terms_of(todo.p)))[0]) - 1
-    return Shape(n, degree, bernstein, multiplier, len(todo.where))
+    return Shape(n, degree, bernstein, multiplier, len(todo.where), further)
 
 
 def data_of(todo: Obligation, shape: Shape) -> Data:
@@ -102,27 +125,30 @@ def data_of(todo: Obligation, shape: Shape) -> Data:
 
     Raises:
         Refused: its orders in s exceed the Bernstein degrees.
-        KeyError: its degree in y exceeds 2 `degree`.
     """
-    p = _floats(todo.p, todo, shape.bernstein, _index(shape.n, 2 * shape.degree))
-    p[:, 0] -= float(todo.error)
-    width, side = shape.bernstein - shape.multiplier + 1, _index(shape.n, 1)
-    g = [_floats(each, todo, shape.bernstein - shape.multiplier, side) for each in todo.where]
-    return Data(p, np.array(g).reshape(len(g), width, len(side)))
+    p, lost = _floats(todo.p, todo, shape.bernstein, _products(shape.basis, 2 * shape.degree))
+    p[:, 0] -= float(todo.error) + lost
+    side, rest = check.monomials(shape.n, 1), shape.bernstein - shape.multiplier
+    g = [_floats(each, todo, rest, side)[0] for each in todo.where]
+    return Data(p, np.array(g).reshape(len(g), rest + 1, len(side)))
 
 
-def _floats(p, todo: Obligation, degree: int, index: dict) -> np.ndarray:
-    parts = check.bernstein(p, degree, todo.low, todo.high, "program")
-    table = np.zeros((degree + 1, len(index)))
-    for row, part in zip(table, parts, strict=True):
+def _floats(p, todo: Obligation, degree: int, monomials: Monomials) -> tuple[np.ndarray, np.ndarray]:
+    """Its coefficients [j, monomial], and bounds [j] of what other monomials have."""
+    parts, index = check.bernstein(p, degree, todo.low, todo.high, "program"), _index(monomials)
+    table, others = np.zeros((degree + 1, len(index))), np.zeros(degree + 1)
+    for j, part in enumerate(parts):
         for e, c in part.items():
-            row[index[e]] = float(c)
-    return table
+            if e in index:
+                table[j, index[e]] = float(c)
+            else:
+                others[j] += abs(float(c)) * float(check.peak(e))
+    return table, others
 
 
 def lowest(data: Data, shape: Shape, y: np.ndarray) -> float:
     """The least p - error over sampled times and those directions y [n D] where all g >= 0: no margin is larger."""
-    powers = _powers(shape.n, 2 * shape.degree, y)
+    powers = _powers(_products(shape.basis, 2 * shape.degree), y)
     p, conditions = data.p @ powers, [g @ powers[: g.shape[1]] for g in data.g]
     least = np.inf
     for t in np.linspace(0, 1, SAMPLED_TIMES):
@@ -133,10 +159,11 @@ def lowest(data: Data, shape: Shape, y: np.ndarray) -> float:
     return least
 
 
-def _powers(n: int, degree: int, y: np.ndarray) -> np.ndarray:
+def _powers(monomials: Monomials, y: np.ndarray) -> np.ndarray:
     """Monomials [M D] at the directions y [n D]."""
-    table = np.cumprod(np.concatenate([np.ones((1, *y.shape)), np.repeat(y[None], degree, axis=0)]), axis=0)
-    return np.array([np.prod([table[e, i] for i, e in enumerate(m)], axis=0) for m in check.monomials(n, degree)])
+    highest = max(map(max, monomials))
+    table = np.cumprod(np.concatenate([np.ones((1, *y.shape)), np.repeat(y[None], highest, axis=0)]), axis=0)
+    return np.array([np.prod([table[e, i] for i, e in enumerate(m)], axis=0) for m in monomials])
 
 
 def _weights(degree: int, t: float) -> np.ndarray:
@@ -151,17 +178,17 @@ class Program:
     def __init__(self, shape: Shape):
         import cvxpy as cp
 
-        def positive(degree: int) -> "cp.Variable":
-            rows = len(check.monomials(n, degree))
-            return cp.Variable((rows, rows), PSD=True)
+        def positive(basis: Monomials) -> "cp.Variable":
+            return cp.Variable((len(basis), len(basis)), PSD=True)
 
-        n, parts, high, rest = shape.n, shape.bernstein + 1, shape.multiplier, shape.bernstein - shape.multiplier
-        gram, sides = _product_map(n, shape.degree, 0), _product_map(n, shape.degree - 1, 1)
-        size, side = len(check.monomials(n, 2 * shape.degree)), len(check.monomials(n, 1))
+        parts, high, rest = shape.bernstein + 1, shape.multiplier, shape.bernstein - shape.multiplier
+        products, lower = _products(shape.basis, 2 * shape.degree), check.monomials(shape.n, shape.degree - 1)
+        gram, sides = _product_map(shape.basis, products, 0), _product_map(lower, products, 1)
+        size, side = len(products), len(check.monomials(shape.n, 1))
         self._p = cp.Parameter((parts, size))
         self._g = [cp.Parameter((rest + 1, side)) for _ in range(shape.constraints)]
-        self._gram = [positive(shape.degree) for _ in range(parts)]
-        self._multipliers = [[positive(shape.degree - 1) for _ in range(high + 1)] for _ in self._g]
+        self._gram = [positive(shape.basis) for _ in range(parts)]
+        self._multipliers = [[positive(lower) for _ in range(high + 1)] for _ in self._g]
         t = cp.Variable()
         sums: list[Any] = [gram @ cp.vec(each, order="C") + t * np.eye(size)[0] for each in self._gram]
         for g, multipliers in zip(self._g, self._multipliers, strict=True):
@@ -170,7 +197,7 @@ class Program:
                 for b in range(rest + 1):
                     weight = math.comb(high, a) * math.comb(rest, b) / math.comb(high + rest, a + b)
                     sums[a + b] += weight * products[:, b]
-        self._degree = shape.degree
+        self._shape = shape
         self.problem = cp.Problem(cp.Maximize(t), [each == self._p[j] for j, each in enumerate(sums)])
 
     def margin(self, data: Data, solver: str = SOLVER) -> float:
@@ -192,7 +219,8 @@ class Program:
     def certificate(self) -> GramCertificate:
         """The solution as exact matrices on the grid, lifted to be positive definite."""
         multipliers = [[_exact(each.value) for each in of_one] for of_one in self._multipliers]
-        return GramCertificate(self._degree, [_exact(each.value) for each in self._gram], multipliers)
+        gram = [_exact(each.value) for each in self._gram]
+        return GramCertificate(self._shape.degree, gram, multipliers, self._shape.further)
 
 
 @lru_cache(None)
