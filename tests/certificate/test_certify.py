@@ -9,6 +9,7 @@ from rtcd_jax.certificate import check
 from rtcd_jax.certificate.prove import backward
 from rtcd_jax.certificate.prove import certify as elite
 from rtcd_jax.certificate.prove.closed_loop import Loop, claim_of
+from rtcd_jax.certificate.prove.levels import followed, unit_directions
 from rtcd_jax.certificate.prove.run import Pace, certify_run, rank_correlation
 from rtcd_jax.cli import main as cli
 from rtcd_jax.elite.elite import Elite
@@ -66,6 +67,23 @@ def test_levels_are_as_large_as_the_loop_allows(content):
     assert 6.9 < np.linalg.norm(axes[1]) <= 7
     decay_margins = [each.decay_margin for each in steps_of(swing.elite())]
     assert max(decay_margins) <= 0.04
+
+
+@pytest.mark.parametrize("limits", [None, [10.0, 7.0]])
+def test_levels_follow_the_growth_of_v_within_an_interval(limits):
+    """|y| falls between the instants too, by hardly more than it must, and no limit is exceeded."""
+    arrays, record = swing.elite()
+    elite = Elite.of(arrays, {**record, **({"state_limits": limits} if limits else {})})
+    loop, directions, rho, k = Loop(claimed(elite), elite), unit_directions(2), 15.0, 1
+    level, course = followed(loop, k, 0.0, 1.0, rho, 0.04, directions)
+    rises = []
+    for t in np.linspace(0, 1, 33):
+        axes, rate = course.at(t, loop.dt)
+        rises.append(loop.rise(k, t, axes, rate, directions))
+        assert np.all(np.linalg.norm(axes, axis=1) <= loop.clearance(k, t))
+    assert -0.1 < max(rises) < 0
+    np.testing.assert_allclose(course.first @ course.first.T, level * np.linalg.inv(loop.value(k, 0.0)[0]), rtol=1e-9)
+    np.testing.assert_allclose(course.last @ course.last.T, rho * np.linalg.inv(loop.value(k, 1.0)[0]), rtol=1e-9)
 
 
 def steps_of(stored):

@@ -20,16 +20,16 @@ def anywhere(p, low=0.0, high=1.0):
     return Obligation(p, NOTHING, NOTHING, [], exact(low), exact(high))
 
 
-def shown(todo, degree, bernstein=0, multiplier=0, solver=program.SOLVER):
+def shown(todo, degree, bernstein=0, multiplier=0, solver=program.SOLVER, further=()):
     """The margin that the checker accepts, or None."""
-    shape = program.shape_of(todo, degree, bernstein, multiplier)
+    shape = program.shape_of(todo, degree, bernstein, multiplier, further)
     found = program.solve(program.data_of(todo, shape), shape, solver)
     return None if found is None else float(check.margin(todo, found.certificate, "theorem"))
 
 
-def largest(todo, degree, bernstein=0, multiplier=0, solver=program.SOLVER):
+def largest(todo, degree, bernstein=0, multiplier=0, solver=program.SOLVER, further=()):
     """The program's optimum, of whatever sign."""
-    shape = program.shape_of(todo, degree, bernstein, multiplier)
+    shape = program.shape_of(todo, degree, bernstein, multiplier, further)
     return program.program_of(shape).margin(program.data_of(todo, shape), solver)
 
 
@@ -138,6 +138,26 @@ def test_conditions_hold_by_multipliers_and_solvers_agree_on_both_sides(threshol
     assert largest(todo, 2, 3, 1, solver) == pytest.approx(expected, abs=1e-4)
     margin = shown(todo, 2, 3, 1, solver)
     assert margin is None if expected < 0 else margin == pytest.approx(expected, abs=1e-4)
+
+
+FOURTH = tuple(e for e in check.monomials(3, 4) if sum(e) == 4)
+
+
+def test_further_monomials_make_up_for_a_lower_degree():
+    """All those of the next degree are that degree."""
+    assert largest(motzkin(), 3, further=FOURTH) == pytest.approx(largest(motzkin(), 4), abs=1e-5)
+    lack = -largest(motzkin(), 3)
+    assert shown(lifted(0.1 * lack), 3) is None
+    assert shown(lifted(0.1 * lack), 3, further=FOURTH) > 0
+
+
+def test_what_no_square_has_counts_as_error():
+    """1 + y_1^8 / 2 on the circle: at least 1, of which squares of cubics show 1 / 2."""
+    todo = anywhere(polynomial(2, {(0, 0, 0): Q(1), (0, 8, 0): Q(1, 2)}))
+    assert shown(todo, 3) == pytest.approx(0.5, abs=1e-5)
+    assert shown(todo, 3, further=((4, 0),)) == pytest.approx(1, abs=1e-5)
+    shape = program.shape_of(todo, 3, 0, 0)
+    assert program.lowest(program.data_of(todo, shape), shape, np.array([[0.0], [1.0]])) == pytest.approx(0.5)
 
 
 def test_another_solver_finds_what_motzkin_lacks():

@@ -22,7 +22,8 @@ from tests.certificate.test_check import leaves, resealed
 from tests.certificate.test_hostile import hostile_files, lines_are_the_checker_s_own
 
 FILES = Path(__file__).parent / "files"
-KINDS = ("version1", "version2_age", "box", "age", "cartpole", "two_joints", "two_joints_box", "box_and_age")
+KINDS = ("version1", "version2_age", "box", "age", "cartpole", "two_joints", "two_joints_box", "box_and_age",
+         "further")  # fmt: skip
 """Certificates of every kind of claim; all but the first two end with the last intervals of a test's elite."""
 
 
@@ -139,7 +140,7 @@ def term_changed(content, dice):
 
 
 def case_changed(content, dice):
-    """A case left out, under another name, or with another's proof; another degree; other orders."""
+    """A case left out, under another name, or with another's proof; another degree, other monomials, other orders."""
     piece = dice.choice([*content["funnel"], *content["goal"]["shells"]])
     cases, kind = piece["cases"], dice.randrange(6)
     name, other = dice.choice(list(cases)), dice.choice(list(cases))
@@ -151,6 +152,8 @@ def case_changed(content, dice):
         cases[name], cases[other] = cases[other], cases[name]
     elif kind == 3:
         cases[name]["degree"] += dice.choice([-1, 1])
+    elif kind == 4 and "further" in cases[name]:
+        dice.choice(cases[name]["further"])[dice.randrange(2)] += dice.choice([-1, 1])
     elif kind == 4 and "orders" in piece:
         piece["orders"][dice.randrange(2)] += dice.choice([-1, 1])
     else:

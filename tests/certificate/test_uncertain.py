@@ -67,14 +67,14 @@ def borne(borne_text):
 
 
 def test_a_file_of_version_1_has_the_verdict_that_it_had(content):
-    """And an elite without uncertainty has the same margin and volumes in version 2."""
+    """And an elite without uncertainty, proved anew in version 2, has the same goal region and no smaller a funnel."""
     old = json.loads(gzip.decompress(VERSION_1.read_bytes()))
     then, now = check.check(old), check.check(content)
     assert then.margin == pytest.approx(MARGIN_THEN, rel=1e-7)
     assert then.volumes["inlet"] == INLET_THEN
-    assert now.margin == pytest.approx(then.margin, rel=1e-6)
-    assert now.volumes == then.volumes
-    assert np.allclose(now.rest, then.rest, rtol=1e-6, atol=0)
+    assert now.volumes["goal"] == then.volumes["goal"]
+    assert now.volumes["inlet"] >= then.volumes["inlet"]
+    assert np.allclose(now.rest, then.rest, rtol=1e-5, atol=0)
     old["claim"]["parameters"]["m"] = nudged(old["claim"]["parameters"]["m"], 0.5)
     assert refusal(resealed(old))
 

@@ -57,6 +57,7 @@ constexpr int BITS = 128;             // of the fixed point in which enclosures 
 constexpr long MAX_BYTES = 1L << 27;  // of a file
 constexpr int MAX_ORDER = 16, MAX_TERMS = 6000, MAX_NOTES = 20, LONGEST_NAME = 40, LONGEST_NOTE = 79;
 constexpr int MOST_JOINTS = 4, MOST_TERMS_OF_ROBOT = 200, HIGHEST = 8, MOST_UNCERTAIN = 6, MOST_GRAMS = 32;
+constexpr size_t MOST_FURTHER = 32;
 constexpr int MAX_DEPTH = 100;                   // of lists and objects; a certificate has a dozen
 constexpr double MOST_COEFFICIENTS = 4e6;        // of a polynomial in Bernstein form: some 200 MB
 constexpr long MOST_TURNS = 1000000;             // largest angle [rad] of a goal
@@ -1391,6 +1392,7 @@ struct Gram {
   int degree;
   vector<Matrix> gram;
   vector<vector<Matrix>> multipliers;
+  vector<Key> further;  // monomials of the squares beside those up to the degree
 };
 
 // To show: q > 0 where |y| = 1, s in [low, high] and all `where` >= 0; q is within `error` of p, a polynomial by s and y.
@@ -1469,6 +1471,7 @@ void require_definite(const Matrix& m, size_t rows, const string& place) {
 // A lower bound > 0 of q where the obligation asks for it.
 Q margin(const Obligation& todo, const Gram& proof, int n, const string& place) {
   auto z = monomials(n, proof.degree), lower = monomials(n, proof.degree - 1);
+  z.insert(z.end(), proof.further.begin(), proof.further.end());
   int degree = int(proof.gram.size()) - 1;
   auto parts = in_bernstein(todo.p, n, degree, todo.low, todo.high, place);
   require(proof.multipliers.size() == todo.where.size(), place, "needs " + std::to_string(todo.where.size()) + " multipliers");
@@ -2434,10 +2437,22 @@ void read_cases(const Node& node, int n, vector<string>& names, std::map<string,
   names = node.value->keys;
   for (auto& name : names) {
     Node one = node.at(name);
-    one.exactly({"degree", "gram", "multipliers"});
+    vector<string> parts{"degree", "gram", "multipliers"};
+    if (one.is(Value::OBJECT) && one.has("further")) parts.push_back("further");
+    one.exactly(parts);
     Gram proof;
     proof.degree = int(one.at("degree").integer(1, MAX_ORDER / 2));
-    size_t rows = monomials(n, proof.degree).size(), sides = monomials(n, proof.degree - 1).size();
+    if (parts.size() == 4) {
+      auto listed = one.at("further").items(-1, 1);
+      one.at("further").require(listed.size() <= MOST_FURTHER, "must have at most " + std::to_string(MOST_FURTHER) + " monomials");
+      for (auto& each : listed) {
+        auto exponents = each.items(n);
+        Key key = 0;
+        for (int i = 0; i < n; i++) key += power(i, int(exponents[size_t(i)].integer(0, MAX_ORDER / 2)));
+        proof.further.push_back(key);
+      }
+    }
+    size_t rows = monomials(n, proof.degree).size() + proof.further.size(), sides = monomials(n, proof.degree - 1).size();
     auto grams = one.at("gram").items(-1, 1);
     grams[0].require(grams.size() <= MOST_GRAMS, "must have at most " + std::to_string(MOST_GRAMS) + " matrices");
     for (auto& each : grams) proof.gram.push_back(each.symmetric(rows));

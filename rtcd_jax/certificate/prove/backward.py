@@ -2,8 +2,8 @@
 
 On an interval the level follows the fastest growth of V, found on sampled directions, plus a decay margin: a rate that
 the level gives away so that V falls strictly. The limits on the states cap the level. The semidefinite program then
-only verifies. Where it fails, the decay margin is raised, then the interval halved, and so on. Where it leaves much more
-than it needs, the interval is proved once more with a lower decay margin.
+only verifies. Where it fails, the decay margin is raised, then the interval halved, and so on. Where it leaves much
+more than it needs, the interval is proved once more with a lower decay margin.
 """
 
 from collections.abc import Iterator
@@ -182,7 +182,9 @@ class BackwardProof:
             todo = check.funnel_obligations(self.claim, interval, "interval")
             if max(float(each.error) for each in todo.values()) <= ERROR_FRACTION * decay_margin:
                 break
-        sizes = [(degree, ()) for degree in range(FEWEST, tier.degree + tier.further)]
+        sizes: list[tuple[int, program.Monomials]] = [
+            (degree, ()) for degree in range(FEWEST, tier.degree + tier.further)
+        ]
         sizes.append((tier.degree, self._of_the_angles(tier.degree) if tier.further else ()))
         shapes = {
             case: [program.shape_of(each, degree, tier.time_order, MULTIPLIER if each.where else 0, further)

@@ -16,7 +16,7 @@ from rtcd_jax.certificate import check
 from rtcd_jax.certificate.check import Claim, GramCertificate, Node, Refused
 from rtcd_jax.certificate.enlarge import all_knots as joint
 from rtcd_jax.certificate.enlarge import knot_by_knot as backward
-from rtcd_jax.certificate.prove.backward import BackwardProof, Proved, ProofState
+from rtcd_jax.certificate.prove.backward import BackwardProof, ProofState, Proved
 from rtcd_jax.certificate.prove.closed_loop import Loop, claim_of, double, doubles, with_digests
 from rtcd_jax.certificate.prove.goal import GoalRegion, goal_region
 from rtcd_jax.certificate.prove.levels import leveled, unit_directions

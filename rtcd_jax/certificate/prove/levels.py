@@ -22,6 +22,8 @@ FRACTION_OF_LIMIT = 0.99
 DIRECTION_COUNTS = {2: 720, 4: 4000}
 ROUNDS = 3
 """Linear programs by which the level of an interval that is proved follows the growth of V."""
+SPARE = 0.1
+"""Weight of how much faster |y| falls, beside the level."""
 INSTANTS = np.linspace(0, 1, 7)
 """Fractions of such an interval at which the growth is sampled."""
 DECAY_MARGIN = 0.02
@@ -141,7 +143,8 @@ def followed(
     decay margin or faster at all sampled instants.
 
     The cubic of `carried_back` follows V's growth at both ends alone. It is scaled by exp(c(t)), c(end) = 0, with a
-    quadratic c' no smaller than what is missing, of which a linear program finds the one with the least integral.
+    quadratic c' no smaller than what is missing, of which a linear program finds the one with the least integral. The
+    limits on the states hold at the instants, too; where only they bind, c' exceeds what is missing by all it can.
 
     Raises:
         Refused: the level vanishes.
@@ -150,23 +153,40 @@ def followed(
     carried = carried_back(loop, k, start, end, rho, decay_margin, directions)
     first, last = loop.axes(k, start, carried.rho, carried.first), loop.axes(k, end, rho, carried.last)
     level, course = carried.rho, Course(*first, *last)
-    cap = BOX_FRACTION * loop.box_level(k, start)
-    powers = np.stack([np.ones_like(INSTANTS), INSTANTS, INSTANTS**2], axis=1)
-    integral = np.array([1, 1 / 2, 1 / 3]) * duration
+    fractions = start + INSTANTS * (end - start)
+    caps = np.log([BOX_FRACTION * loop.box_level(k, fraction) for fraction in fractions[:-1]])
+    shapes = [np.linalg.slogdet(loop.value(k, fraction)[0])[1] for fraction in fractions[:-1]]
     for _ in range(ROUNDS):
-        missing = decay_margin / 2 + np.array(
-            [loop.rise(k, start + t * (end - start), *course.at(t, duration), directions) for t in INSTANTS]
-        )
-        room = np.log(cap / level) / 2
-        solution = linprog(
-            integral, -np.vstack([powers, integral]), -np.append(missing, -room), bounds=(None, None)
-        )
-        require(solution.status == 0, "interval", "no cubic level follows the growth of V")
-        c_rate = solution.x
-        by = np.exp(-integral @ c_rate)
+        ellipsoids = [course.at(t, duration) for t in INSTANTS]
+        rises = [loop.rise(k, f, *each, directions) for f, each in zip(fractions, ellipsoids, strict=True)]
+        sizes = [2 * np.linalg.slogdet(axes)[1] for axes, _ in ellipsoids[:-1]]
+        room = (caps - np.add(sizes, shapes) / loop.n) / 2  # of the logarithm of L
+        by, first_growth, last_growth = _least_scale(np.array(rises) + decay_margin / 2, room, duration)
         level *= by**2
-        course = course.scaled(by, c_rate[0], c_rate.sum())
+        course = course.scaled(by, first_growth, last_growth)
     return float(level), course
+
+
+def _least_scale(missing: np.ndarray, room: np.ndarray, duration: float) -> tuple[float, float, float]:
+    """exp(c) at the start, and c' at the start and at the end, of `followed`: c' [1/s] is at least `missing` at the
+    `INSTANTS`, and c at most `room` at all but the last.
+
+    Raises:
+        Refused: there is none.
+    """
+    powers = np.stack([np.ones_like(INSTANTS), INSTANTS, INSTANTS**2], axis=1)
+    integrals = (1 - INSTANTS[:-1, None] ** [1, 2, 3]) / [1, 2, 3] * duration  # -c at an instant, of the powers
+    bounded = np.isfinite(room)
+    rows, excess = -np.vstack([powers, integrals[bounded]]), np.append(np.ones(len(powers)), np.zeros(bounded.sum()))
+    solution = linprog(
+        np.append(integrals[0], -SPARE * duration),
+        np.column_stack([rows, excess]),
+        np.append(-missing, room[bounded]),
+        bounds=[(None, None)] * 3 + [(0, None)],
+    )
+    require(solution.status == 0, "interval", "no cubic level follows the growth of V")
+    rate = solution.x[:3]
+    return float(np.exp(-integrals[0] @ rate)), float(rate[0]), float(rate.sum())
 
 
 def leveled(loop: Loop, directions: np.ndarray) -> Loop:

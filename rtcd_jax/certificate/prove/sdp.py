@@ -6,9 +6,10 @@ maximize t  such that, for every Bernstein index j and modulo |y|^2 = 1,
     sigma_i = sum_a B_a(s) z'S_ia z,    S_ia >= 0
 
 (check has the theorem). The time s stays outside the Gram matrices, and the sphere makes them small: with monomials
-up to degree 3, 7 rows for two states and 30 for four. A polynomial of higher degree is one in the angles nearly: a few
-`further` monomials of z hold it. What no product of theirs has counts as error. cvxpy states the program once a shape, with p and g as its
-parameters, and hands it to any solver that is installed: the exact checker decides what a solution is worth.
+up to degree 3, 7 rows for two states and 30 for four. What is of higher degree is mostly one in the angles, for
+which a few `further` monomials of z are enough; what no product of theirs has counts as error. cvxpy states the program
+once a shape, with p and g as its parameters, and hands it to any solver that is installed: the exact checker decides
+what a solution is worth.
 """
 
 import contextlib
