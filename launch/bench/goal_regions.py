@@ -47,7 +47,7 @@ def regulated(name: str) -> Elite:
     }  # fmt: skip
     limits = [None if np.isinf(limit) else limit for limit in config.task.state_limits]
     record = {
-        "plant": name, "parameters": robot.parameters(values), "state_limits": limits, "rung": "sampled",
+        "plant": robot.name, "parameters": robot.parameters(values), "state_limits": limits, "rung": "sampled",
         "epsilon": 1.0, "confidence": 0.0,
     }  # fmt: skip
     claimed = claimed_robot(Elite.of(arrays, record))

@@ -15,7 +15,7 @@ BITS = 80
 MAX_ORDER = 16
 """Of polynomials: no file may ask for more."""
 MAX_TERMS = 6000
-"""Of a Taylor model: a product of two takes two seconds then. The cart-pole's goal region has 2142."""
+"""Of a Taylor model: a product of two takes two seconds then. The cart-pole's intervals have up to 3960."""
 MAX_FURTHER = 32
 """Of the monomials of a sum of squares, beside those up to its degree."""
 MAX_BYTES = 1 << 27

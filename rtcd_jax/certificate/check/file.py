@@ -397,7 +397,7 @@ def read_goal(node: Node, claim: Claim) -> Goal:
         )
         reached = shell.end
     items.require(reached == 1, f"ends at {rounded(reached):g}, must end at 1")
-    require_few_terms(order, claim.n, MAX_ORDER, order.integer(2, MAX_ORDER - 2))
+    require_few_terms(order, claim.n, 0, order.integer(2, MAX_ORDER - 2))  # each power of y has the same one of l
     return Goal(
         axes.array(claim.n, claim.n), order.value, weight.number(), rest, shells,
         more[int(ended)].array(claim.n) if claim.first_order else [],

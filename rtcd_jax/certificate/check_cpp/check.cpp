@@ -2522,7 +2522,7 @@ Goal read_goal(const Node& node, const Claim& claim) {
   }
   node.at("shells").require(reached == 1, "ends at " + formatted("%g", rounded(reached)) + ", must end at 1");
   goal.order = int(node.at("order").integer(2, MAX_ORDER - 2));
-  require_few_terms(node.at("order"), long(claim.n()), MAX_ORDER, goal.order);
+  require_few_terms(node.at("order"), long(claim.n()), 0, goal.order);  // each power of y has the same one of l
   goal.axes = node.at("axes").matrix(long(claim.n()), long(claim.n()));
   goal.weight = node.at("weight").number();
   if (claim.first_order) goal.late = node.at("late").row(long(claim.n()));

@@ -50,6 +50,10 @@ class Tier(NamedTuple):
     degree: int
     further: bool = False
 
+    def further_monomials(self, loop: Loop) -> program.Monomials:
+        """Beyond the degree."""
+        return program.of_the_angles(loop.n, len(loop.hinges), self.degree) if self.further else ()
+
 
 TIERS = {
     2: (Tier(5, 5, 3), Tier(5, 7, 4), Tier(5, 9, 5), Tier(5, 11, 6)),
@@ -185,20 +189,13 @@ class BackwardProof:
         sizes: list[tuple[int, program.Monomials]] = [
             (degree, ()) for degree in range(FEWEST, tier.degree + tier.further)
         ]
-        sizes.append((tier.degree, self._of_the_angles(tier.degree) if tier.further else ()))
+        sizes.append((tier.degree, tier.further_monomials(self.loop)))
         shapes = {
             case: [program.shape_of(each, degree, tier.time_order, MULTIPLIER if each.where else 0, further)
                    for degree, further in sizes]
             for case, each in todo.items()
         }  # fmt: skip
         return interval, todo, shapes
-
-    def _of_the_angles(self, degree: int) -> program.Monomials:
-        """The monomials of the next degree, but for one power at most, in those y by which the angles are."""
-        angles = len(self.loop.hinges)
-        return tuple(
-            e for e in check.monomials(self.claim.n, degree + 1) if sum(e) > degree and sum(e[:angles]) >= degree
-        )
 
 
 def prove(

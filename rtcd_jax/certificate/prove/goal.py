@@ -1,12 +1,13 @@
 """The goal region: the largest level of V about the goal that can be proved under its saturated LQR, for all time."""
 
+import itertools
 from typing import NamedTuple
 
 import numpy as np
 
 from rtcd_jax.certificate import check
 from rtcd_jax.certificate.check import Claim, Refused, Shell
-from rtcd_jax.certificate.prove.backward import MULTIPLIER, prove
+from rtcd_jax.certificate.prove.backward import MULTIPLIER, Tier, prove
 from rtcd_jax.certificate.prove.closed_loop import Loop, on_grid
 from rtcd_jax.certificate.prove.levels import goal_level, unit_directions
 from rtcd_jax.certificate.prove.sdp import SOLVER, shape_of
@@ -15,8 +16,10 @@ LEVEL_FRACTIONS = (1.0, 0.995, 0.985, 0.97, 0.95, 0.92, 0.88, 0.83, 0.77, 0.7, 0
 """Fractions of the level that the samples allow, in the order of trial."""
 OUTLET_CLEARANCE = 1e-3
 """Fraction of the level by which the funnel's outlet is smaller than the goal region."""
-ORDERS = {2: 9, 4: 5}
-"""By the number of states: order of Taylor models; the monomials have half the degree, rounded up."""
+TIERS = {2: (Tier(10, 9, 5),), 4: (Tier(6, 5, 3), Tier(12, 11, 3, True))}
+"""By the number of states: in the place of the order in s, the degree of the Bernstein polynomials in l."""
+ENOUGH = 0.1
+"""Margin [1/s] of a case beyond which it needs no further monomials."""
 NARROWEST = 1 / 64
 """Narrowest shell of levels."""
 
@@ -45,19 +48,26 @@ def goal_region(claim: Claim, loop: Loop, exact: bool, rest: float = 0.0, solver
         most = goal_level(loop, directions)
     except Refused:
         return None
-    for fraction in LEVEL_FRACTIONS:
-        region = _at_level(claim, loop, fraction * most, exact, directions, rest, solver)
+    for fraction, tier in itertools.product(LEVEL_FRACTIONS, TIERS[claim.n]):
+        region = _at_level(claim, loop, fraction * most, tier, exact, directions, rest, solver)
         if region is not None:
             return region
     return None
 
 
 def _at_level(
-    claim: Claim, loop: Loop, rho: float, exact: bool, directions: np.ndarray, most_rest: float, solver: str
+    claim: Claim,
+    loop: Loop,
+    rho: float,
+    tier: Tier,
+    exact: bool,
+    directions: np.ndarray,
+    most_rest: float,
+    solver: str,
 ) -> GoalRegion | None:
-    last, order = len(loop.u) - 1, ORDERS[claim.n]
-    axes = on_grid(loop.axes(last, 1.0, rho, 0.0)[0])
-    degree, waiting, shells, least, rest = (order + 2) // 2, [(0.0, 1.0)], [], np.inf, 0.0
+    axes = on_grid(loop.axes(len(loop.u) - 1, 1.0, rho, 0.0)[0])
+    order, degree, further = tier.order, tier.degree, tier.further_monomials(loop)
+    waiting, shells, least, rest = [(0.0, 1.0)], [], np.inf, 0.0
     try:
         late = loop.goal_late_row() if claim.first_order else []
         field = check.goal_field(claim, axes, order, "goal", late)
@@ -68,10 +78,13 @@ def _at_level(
             if start or not claim.moves_the_goal:
                 todo = check.goal_obligations(claim, field, *ends)
                 shapes = {
-                    case: [shape_of(each, degree, order + 1, MULTIPLIER if each.where else 0)]
+                    case: [
+                        shape_of(each, degree, tier.time_order, MULTIPLIER if each.where else 0, monomials)
+                        for monomials in dict.fromkeys(((), further))
+                    ]
                     for case, each in todo.items()
                 }
-                proof = prove(todo, shapes, 0.0, exact, directions, solver)
+                proof = prove(todo, shapes, ENOUGH, exact, directions, solver)
             if proof is not None:
                 shells.append(Shell(*ends, proof[0]))
                 least = min(least, proof[1])

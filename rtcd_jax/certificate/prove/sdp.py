@@ -116,6 +116,13 @@ def _product_map(basis: Monomials, products: Monomials, side: int) -> sp.csc_mat
     return sp.csc_matrix((np.array(values, float), (rows, columns)), shape=shape)
 
 
+def of_the_angles(n: int, angles: int, degree: int) -> Monomials:
+    """The monomials of the next degree that have at most one power of others than the first y, by which the angles
+    are.
+    """
+    return tuple(e for e in check.monomials(n, degree + 1) if sum(e) > degree and sum(e[:angles]) >= degree)
+
+
 def shape_of(todo: Obligation, degree: int, bernstein: int, multiplier: int, further: Monomials = ()) -> Shape:
     n = len(next(iter(check.terms_of(todo.p)))[0]) - 1
     return Shape(n, degree, bernstein, multiplier, len(todo.where), further)
