@@ -1,6 +1,5 @@
 """The goal region: the largest level of V about the goal that can be proved under its saturated LQR, for all time."""
 
-import itertools
 from typing import NamedTuple
 
 import numpy as np
@@ -48,10 +47,11 @@ def goal_region(claim: Claim, loop: Loop, exact: bool, rest: float = 0.0, solver
         most = goal_level(loop, directions)
     except Refused:
         return None
-    for fraction, tier in itertools.product(LEVEL_FRACTIONS, TIERS[claim.n]):
-        region = _at_level(claim, loop, fraction * most, tier, exact, directions, rest, solver)
-        if region is not None:
-            return region
+    for fraction in LEVEL_FRACTIONS:
+        for tier in TIERS[claim.n]:
+            region = _at_level(claim, loop, fraction * most, tier, exact, directions, rest, solver)
+            if region is not None:
+                return region
     return None
 
 
