@@ -19,6 +19,8 @@ TIERS = {2: (Tier(10, 9, 5),), 4: (Tier(6, 5, 3), Tier(12, 11, 3, True))}
 """By the number of states: in the place of the order in s, the degree of the Bernstein polynomials in l."""
 ENOUGH = 0.1
 """Margin [1/s] of a case beyond which it needs no further monomials."""
+SMALL_ERROR = 0.1
+"""Error [1/s] of the models up to which richer ones do not help."""
 NARROWEST = 1 / 64
 """Narrowest shell of levels."""
 
@@ -49,9 +51,11 @@ def goal_region(claim: Claim, loop: Loop, exact: bool, rest: float = 0.0, solver
         return None
     for fraction in LEVEL_FRACTIONS:
         for tier in TIERS[claim.n]:
-            region = _at_level(claim, loop, fraction * most, tier, exact, directions, rest, solver)
+            region, error = _at_level(claim, loop, fraction * most, tier, exact, directions, rest, solver)
             if region is not None:
                 return region
+            if error <= SMALL_ERROR:
+                break
     return None
 
 
@@ -64,10 +68,11 @@ def _at_level(
     directions: np.ndarray,
     most_rest: float,
     solver: str,
-) -> GoalRegion | None:
+) -> tuple[GoalRegion | None, float]:
+    """The region of a level, and the error [1/s] of its models."""
     axes = on_grid(loop.axes(len(loop.u) - 1, 1.0, rho, 0.0)[0])
     order, degree, further = tier.order, tier.degree, tier.further_monomials(loop)
-    waiting, shells, least, rest = [(0.0, 1.0)], [], np.inf, 0.0
+    waiting, shells, least, rest, error = [(0.0, 1.0)], [], np.inf, 0.0, np.inf
     try:
         late = loop.goal_late_row() if claim.first_order else []
         field = check.goal_field(claim, axes, order, "goal", late)
@@ -77,6 +82,7 @@ def _at_level(
             proof = None
             if start or not claim.moves_the_goal:
                 todo = check.goal_obligations(claim, field, *ends)
+                error = max(float(each.error) for each in todo.values())
                 shapes = {
                     case: [
                         shape_of(each, degree, tier.time_order, MULTIPLIER if each.where else 0, monomials)
@@ -95,8 +101,8 @@ def _at_level(
                 rest = end
                 break
             else:
-                return None
+                return None, error
     except Refused:
-        return None
+        return None, error
     outlet, sides = (1 - OUTLET_CLEARANCE) * rho, loop.goal_sides()
-    return GoalRegion(rho, outlet, axes, order, rest, shells[::-1], least, late, sides)
+    return GoalRegion(rho, outlet, axes, order, rest, shells[::-1], least, late, sides), error
