@@ -141,7 +141,7 @@ def test_too_large_a_file_is_undecided(asked, tmp_path, capsys):
     with path.open("wb") as file:
         file.truncate(MAX_BYTES + 1)
     assert check.main([str(path)]) == 2
-    assert "large.json: has more than 134217728 bytes: undecided" in capsys.readouterr().err
+    assert "large.json: has more than 268435456 bytes: undecided" in capsys.readouterr().err
 
 
 def test_polynomials_too_large_to_multiply_are_refused(content, asked):

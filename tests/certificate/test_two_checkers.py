@@ -305,7 +305,7 @@ def test_too_large_a_file_is_undecided(second, tmp_path):
     path = tmp_path / "x.json"
     with path.open("wb") as file:
         file.truncate(MAX_BYTES + 1)
-    assert asked(second, path) == (2, "", f"{path}: has more than 134217728 bytes: undecided\n")
+    assert asked(second, path) == (2, "", f"{path}: has more than 268435456 bytes: undecided\n")
 
 
 def test_the_second_gives_up_in_time_and_tells_wrong_options(second, tmp_path):

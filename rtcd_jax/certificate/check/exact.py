@@ -18,8 +18,8 @@ MAX_TERMS = 6000
 """Of a Taylor model: a product of two takes two seconds then. The cart-pole's intervals have up to 3960."""
 MAX_FURTHER = 32
 """Of the monomials of a sum of squares, beside those up to its degree."""
-MAX_BYTES = 1 << 27
-"""Of a file; the cart-pole's have up to 5e7."""
+MAX_BYTES = 1 << 28
+"""Of a file; those of the cart-pole have up to 2e8."""
 PI = Q(314159265358979323846264338327950288419716939937510, 10**50)
 PI_ERROR = Q(1, 10**49)
 
