@@ -128,8 +128,10 @@ def require_one_task(path: Path) -> None:
 
 
 def require_held_goal(path: Path, verb: str) -> None:
-    """Raises UserError if the motions of a run end in a catch set, after which `verb` would go on."""
-    if read_config(path).task.caught:
+    """Raises UserError if the motions of a run end in a catch set, after which `verb` would go on; elites without a run
+    have none.
+    """
+    if (path / "format.json").is_file() and read_config(path).task.caught:
         raise UserError(
             f"{path} ends in a catch set (task.catch): rtcd {verb} needs a goal that is held after the motion"
         )

@@ -29,7 +29,7 @@ RECLAIMED = 0.8
 """Share of the certificates' margin by which the decay margin is lowered."""
 WASTED = 1 / 4
 """Share of the decay margin beyond which the certificates' margin is worth a second attempt."""
-LOW = 1 / 3
+LOW = 0.35
 """Share of that up to which a decay margin is low: the next interval is twice as long."""
 SHORTEST = 1 / 16
 """Shortest fraction of the knots' interval."""
