@@ -38,8 +38,8 @@ def disturb_run(folder: Path, states: int, seed: int, console: Console) -> None:
             read or written, or other devices than JAX_PLATFORMS or Slurm says.
     """
     require_devices()
-    require_held_goal(folder, "disturb")
     comparison = read_comparison(folder, console)
+    require_held_goal(folder, "disturb")
     place = folder / "disturbance"
     make_folder(place)
     meter = Meter(console, _all_motions(comparison, states))
