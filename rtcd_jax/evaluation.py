@@ -21,9 +21,11 @@ from rtcd_jax.numerics.interior_point import CACHE, VECTOR
 from rtcd_jax.numerics.loops import on_gpu
 from rtcd_jax.policy import input_jumps, stabilize
 from rtcd_jax.problem import Problem
+from rtcd_jax.reset import closed, values_at_resets
 from rtcd_jax.system.devices import path_batch
+from rtcd_jax.system.errors import UserError
 from rtcd_jax.trajectory import plan
-from rtcd_jax.types import Candidate, Evaluation, Funnel, Policy, Status, TaskEvaluations, Volumes
+from rtcd_jax.types import Candidate, Evaluation, Funnel, Policy, Status, TaskEvaluations, Trajectory, Volumes
 from rtcd_jax.validation import Dynamics, PhysicsComparison, Rollouts, SamplingBudget, compare_physics
 from rtcd_jax.volume import DIRTREL, OVER_TASKS, funnel_volume
 
@@ -33,6 +35,11 @@ MOST_ON_A_CPU = 512
 
 Evaluate = Callable[[Float[Array, "P d"], PRNGKeyArray], Evaluation | TaskEvaluations]
 Budget = Callable[[Problem], SamplingBudget]
+
+RESET_SAMPLES, RESET_SHARE = 1000, 0.9
+"""Samples of every reset in a search, and the share of the next task's first level that they may fill: more directions
+and samples, those of the elites, find lower levels.
+"""
 
 FIRST_SAMPLES = 2000
 """Held-out samples a knot, at most, of the first, cheap rounds of the elites, and of those under further keys."""
@@ -88,29 +95,46 @@ def make_evaluate(problem: Problem, budget: Budget = search_budget) -> Evaluate:
         count = genomes.shape[0]
         batch = count if on_gpu() else batch_in_cache(problem, count)
 
-        def stabilized(pair):
-            return stabilize(problem.of(pair[0]), *pair)
+        def stabilized(one):
+            return stabilize(problem.of(one[0]), *one)
 
         def stiffness(candidate, policy):
             return rollout.stiffness(problem.of(candidate), candidate, policy, budget(problem).funnel)
 
-        policies = in_batches(stabilized, (candidates, trajectories), batch)
+        lasts = None if problem.reset is None else around_cycles(candidates, trajectories, batch)
+        policies = in_batches(stabilized, (candidates, trajectories, lasts), batch)
         # A batch takes the steps that its stiffest candidate needs.
         order = jnp.argsort(jax.vmap(stiffness)(candidates, policies).parts)
         assess = lambda one: _with_funnel(problem, budget, key, *one)  # noqa: E731
         return in_batches(assess, (genomes, candidates, policies), batch, order)
 
+    def around_cycles(candidates: Candidate, trajectories: Trajectory, batch: int) -> Float[Array, "PT n n"]:
+        values = in_batches(
+            lambda one: values_at_resets(problem, *one),
+            jax.tree.map(of_each_genome, (candidates, trajectories)),
+            max(1, batch // tasks),
+        )
+        return values.reshape(-1, *values.shape[2:])
+
+    def of_each_genome(leaf: Array) -> Array:
+        return leaf.reshape(-1, tasks, *leaf.shape[1:])
+
     def of_the_task(genomes: Float[Array, "P d"], key: PRNGKeyArray) -> Evaluation:
         return evaluate(genomes, jax.vmap(partial(decode, problem))(genomes), key)
 
     def of_all_tasks(genomes: Float[Array, "P d"], key: PRNGKeyArray) -> TaskEvaluations:
-        count, tasks = genomes.shape[0], len(problem.tasks)
+        count = genomes.shape[0]
         each = jnp.repeat(genomes, tasks, axis=0)
         candidates = jax.vmap(partial(decode, problem))(each, jnp.tile(jnp.arange(tasks), count))
-        flat = evaluate(each, candidates, key)
-        each_task = jax.tree.map(lambda leaf: leaf.reshape(count, tasks, *leaf.shape[1:]), flat)
-        return over_tasks(each_task, problem.config.search.over_tasks)
+        each_task = jax.tree.map(of_each_genome, evaluate(each, candidates, key))
+        whole = over_tasks(each_task, problem.config.search.over_tasks)
+        if problem.reset is None:
+            return whole
+        return jax.vmap(lambda one: closed(problem, one, key, RESET_SAMPLES, RESET_SHARE))(whole)
 
+    tasks = len(problem.tasks)
+    if problem.reset is not None and not tasks:
+        raise UserError("task.catch.reset leads from task to task: it needs `tasks`, two at least")
     return of_all_tasks if problem.tasks else of_the_task
 
 

@@ -72,7 +72,7 @@ def estimate_funnel(
     boxes = boxes if rollouts.robots is None else jnp.min(boxes, 0)
     boxes = jnp.minimum(boxes, REACH * saturated)
     scales = jnp.minimum(boxes, saturated)
-    if problem.catch is None:
+    if not problem.caught:
         last = goal_level(rollouts, boxes[-1], saturated, keys[0], budget)
     else:
         caught = catch_weight(problem, candidate)

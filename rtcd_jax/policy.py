@@ -69,7 +69,7 @@ def linearize(
 
 def inputs_at_knots(problem: Problem, trajectory: Trajectory) -> Float[Array, "m knots"]:
     """u* of the interval that begins at each knot: at the last one that of rest or, in a catch set, the last held."""
-    last = jnp.zeros_like(trajectory.us[:1]) if problem.catch is None else trajectory.us[-1:]
+    last = jnp.zeros_like(trajectory.us[:1]) if not problem.caught else trajectory.us[-1:]
     return jnp.concatenate([trajectory.us, last]).T
 
 
@@ -79,30 +79,40 @@ def input_jumps(problem: Problem, candidate: Candidate, trajectory: Trajectory) 
     return jnp.moveaxis(b, -1, 0)
 
 
-def stabilize(problem: Problem, candidate: Candidate, trajectory: Trajectory) -> Policy:
-    """The LQR about a trajectory; RICCATI_INDEFINITE if a value matrix lost positive definiteness."""
+def riccati_intervals(problem: Problem, candidate: Candidate, trajectory: Trajectory) -> riccati.Interval:
+    """The flow of the controller's Riccati equation over every interval, which is the leading axis."""
     substeps = problem.config.trajectory.substeps
     motion = nominal(problem, candidate, trajectory)
     middles = (np.arange(substeps) + 0.5) / substeps
     xs = motion.at(middles)
-    inputs = inputs_at_knots(problem, trajectory)
-    weights = input_weights(problem, candidate, inputs)
+    weights = input_weights(problem, candidate, motion.inputs)
     us = jnp.broadcast_to(motion.inputs[:, :, None], (problem.plant.m, *xs.shape[1:]))
-    pieces = _interval(problem, candidate, xs, us, weights[:, :-1, None], trajectory.dt / substeps)
+    pieces = _interval(problem, candidate, xs, us, weights[:, :, None], trajectory.dt / substeps)
     whole = jax.tree.map(lambda leaf: leaf[..., 0], pieces)
     for piece in range(1, substeps):
         whole = riccati.compose(whole, jax.tree.map(lambda leaf, piece=piece: leaf[..., piece], pieces))
+    return jax.tree.map(lambda leaf: jnp.moveaxis(leaf, -1, 0), whole)
 
-    last, reached = final_value(problem, candidate)
+
+def stabilize(
+    problem: Problem, candidate: Candidate, trajectory: Trajectory, last: Float[Array, "n n"] | None = None
+) -> Policy:
+    """The LQR about a trajectory; RICCATI_INDEFINITE if a value matrix lost positive definiteness.
+
+    `last` is S at t_N where the candidate's cycle says it.
+    """
+    stages = riccati_intervals(problem, candidate, trajectory)
+    last, reached = final_value(problem, candidate) if last is None else (last, jnp.asarray(True))
 
     def backward(carry, interval):
         value, definite = riccati.propagate(interval, carry[0])
         carry = value, carry[1] & definite
         return carry, value
 
-    stages = jax.tree.map(lambda leaf: jnp.moveaxis(leaf, -1, 0), whole)
     (_, definite), values = packed_scan(backward, (last, reached), stages, reverse=True)
     values = jnp.concatenate([values, last[None]])
+    inputs = inputs_at_knots(problem, trajectory)
+    weights = input_weights(problem, candidate, inputs)
     _, b = linearize(problem, candidate, trajectory.xs.T, inputs)
     gains = mm(transpose(b) / weights[:, None], jnp.moveaxis(values, 0, -1))
     status = jnp.where(definite, Status.OK, Status.RICCATI_INDEFINITE)

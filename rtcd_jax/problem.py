@@ -12,7 +12,7 @@ from jaxtyping import Array, Float
 from rtcd_jax.config.load import Config
 from rtcd_jax.config.robot import value_of
 from rtcd_jax.numerics.keep_out import Set, sets_of
-from rtcd_jax.plants import make_plant
+from rtcd_jax.plants import brachiation, make_plant
 from rtcd_jax.plants.base import Plant
 from rtcd_jax.system.devices import require_float64
 from rtcd_jax.system.errors import ConfigError
@@ -27,6 +27,11 @@ UNREACHED = 1e-9
 """Least share of the pencil's largest singular value with which an input reaches a mode."""
 DESIGNS, STATES, LARGEST_STATE = 3, 8, 10.0
 """Where the MJCF is compared with the equations: random designs, states of each, within this or the task's limits."""
+
+SAME = 1e-9
+"""Largest relative difference of two numbers of a robot that should be one."""
+RESETS = {"brachiation": (brachiation.exchanged, brachiation.catch)}
+"""By the name in the configuration: what becomes of the robot's numbers, and of its state."""
 
 
 @dataclass(frozen=True)
@@ -67,10 +72,17 @@ class Problem:
     """C of the catch set {x : (x - goal)' C (x - goal) <= 1} in which the motions end, and no time follows; None where
     the goal is an equilibrium that is held.
     """
+    reset: Callable | None = None
+    """R(numbers of the robot, x) of tasks in a cycle: each motion ends where R leads into the next one's funnel."""
     cost_center: Float[np.ndarray, " n"] | None = None
     """From where the trajectory's cost counts; None for the goal."""
     tasks: tuple["Problem", ...] = ()
     """Where there are several: each alone. Start, goal and the robot's constants are then the first one's."""
+
+    @property
+    def caught(self) -> bool:
+        """Whether the motions end with t_N, and no goal is held."""
+        return self.catch is not None or self.reset is not None
 
     @property
     def intervals(self) -> int:
@@ -134,7 +146,10 @@ def make_problem(config: Config) -> Problem:
         (alone,) = config.each.values()
         return _make_problem(alone, ("task",))
     tasks = tuple(_make_problem(alone, ("tasks", name)) for name, alone in config.each.items())
-    return replace(tasks[0], config=config, keep_out=_keep_out(config), tasks=tasks)
+    whole = replace(tasks[0], config=config, keep_out=_keep_out(config), tasks=tasks)
+    if whole.reset is not None:
+        _require_cycle(whole)
+    return whole
 
 
 def _make_problem(config: Config, path: tuple[str, ...]) -> Problem:
@@ -148,10 +163,11 @@ def _make_problem(config: Config, path: tuple[str, ...]) -> Problem:
         variables=tuple(_variables(config)),
         keep_out=_keep_out(config),
         uncertainty=_uncertainty(config),
-        catch=np.diag(1 / np.square(task.catch.half_widths)) if task.caught else None,
+        catch=np.diag(1 / np.square(task.catch.half_widths)) if task.catch.half_widths else None,
+        reset=RESETS[task.catch.reset][1] if task.catch.cyclic else None,
         cost_center=np.array(task.cost_center, float) if task.cost_center else None,
     )
-    if problem.catch is None:
+    if not problem.caught:
         _require_equilibrium(problem, path)
         _require_stabilizable(problem, path)
     _require_agreement(problem)
@@ -255,6 +271,28 @@ def _require_stabilizable(problem: Problem, path: tuple[str, ...]) -> None:
         f"{problem.plant.state_names[state]} moves most"
     )
     raise ConfigError([Fault((*path, "goal"), text, problem.goal.tolist())])
+
+
+def _require_cycle(problem: Problem) -> None:
+    """Every task's end and robot after the reset must be the start and the robot of the next one, of all designs."""
+    after, reset = RESETS[problem.config.task.catch.reset]
+    names = list(problem.config.tasks)
+    for share in (0.0, *np.random.default_rng(0).random(DESIGNS)):
+        robots = [vars(alone.plant) | vars(_design(alone, share)) for alone in problem.tasks]
+        for i, (alone, robot) in enumerate(zip(problem.tasks, robots, strict=True)):
+            if missing := [name for name in brachiation.FIELDS if name not in robot]:
+                text = f"needs a robot with {', '.join(brachiation.FIELDS)}; there is no {', '.join(missing)}"
+                raise ConfigError([Fault(("task", "catch", "reset"), text, problem.config.task.catch.reset)])
+            following = (i + 1) % len(names)
+            path, behind = ("tasks", names[following]), f"after the reset at the end of {names[i]}"
+            for name, value in after(robot).items():
+                if abs(float(value) - float(robots[following][name])) > SAME * abs(float(value)):
+                    text = f"must be {float(value):.9g}, what it is {behind}"
+                    raise ConfigError([Fault((*path, "plant", name), text, float(robots[following][name]))])
+            start, expected = problem.tasks[following].start, np.asarray(reset(robot, jnp.asarray(alone.goal)))
+            if np.max(np.abs(start - expected)) > AT_REST:
+                text = f"must be {expected.round(9).tolist()}, where the motion is {behind}"
+                raise ConfigError([Fault((*path, "start"), text, start.tolist())])
 
 
 def _quarter_turns(count: int) -> str:

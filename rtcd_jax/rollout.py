@@ -206,7 +206,7 @@ def stiffness(problem: Problem, candidate: Candidate, policy: Policy, funnel: Fu
     inputs = inputs_at_knots(problem, policy.trajectory)
     a, b = linearize(problem, candidate, policy.trajectory.xs.T, inputs)
     fastest = spectral_radius(a - mm(b, jnp.moveaxis(policy.gains, 0, -1)))
-    parts = jnp.ceil(fastest[-1] * funnel.goal.step / STABLE) if problem.catch is None else jnp.ones_like(fastest[-1])
+    parts = jnp.ceil(fastest[-1] * funnel.goal.step / STABLE) if not problem.caught else jnp.ones_like(fastest[-1])
     along = jnp.max(fastest) * policy.trajectory.dt / funnel.steps
     too_stiff = (parts > MOST_PARTS) | (along > STABLE)
     return Stiffness(jnp.where((parts > 1) & ~too_stiff, parts, 1).astype(int), too_stiff)

@@ -35,8 +35,10 @@ class Status(enum.IntEnum):
 _MESSAGES = {
     Status.OK: "has a funnel",
     Status.TRAJECTORY_NOT_SOLVED: "no start of the trajectory optimization reached the tolerances on defects and boxes",
-    Status.RICCATI_INDEFINITE: "the Riccati equation has no positive definite solution along the trajectory",
-    Status.FUNNEL_EMPTY: "a knot's level fell below the smallest sampled level: some knot has no funnel",
+    Status.RICCATI_INDEFINITE: "the Riccati equation has no positive definite solution along the trajectory, or "
+    "around a cycle of tasks",
+    Status.FUNNEL_EMPTY: "a knot's level fell below the smallest sampled level: some knot has no funnel; or "
+    "a reset leads out of the next task's first ellipsoid",
     Status.NOT_FINITE: "a number of the candidate's evaluation is not finite",
     Status.TOO_STIFF: "the closed loop is too fast for the rollouts' steps: raise funnel.steps, lower funnel.goal.step",
 }
@@ -188,13 +190,15 @@ class Evaluation(eqx.Module):
 class TaskEvaluations(eqx.Module):
     """What is known of one genome on every one of several `tasks`, and what the search makes of it.
 
-    `volumes` are those over the tasks, knot by knot too; `status` is that of the first task that failed.
+    `volumes` are those over the tasks, knot by knot too; `status` is that of the first task that failed. Of a cycle
+    `after_reset` is the largest V / rho_0 in the next task's first ellipsoid, at most 1 if it is closed (reset.py).
     """
 
     genome: Float[Array, "*batch d"]
     tasks: Evaluation
     volumes: Volumes
     status: Int[Array, "*batch"]
+    after_reset: Float[Array, "*batch T"] | None = None
 
     @property
     def borne(self) -> Float[Array, "*batch"] | None:

@@ -103,7 +103,7 @@ class Rollouts(NamedTuple):
     @property
     def time_behind(self) -> float:
         """For how long states are followed after t_N [s]: not at all from a catch set."""
-        return self.goal.horizon if self.problem.catch is None else 0.0
+        return self.goal.horizon if not self.problem.caught else 0.0
 
     def roll(
         self, tracking: rollout.TrackingData, x: Float[Array, "n intervals *batch"], dynamics: rollout.Dynamics
@@ -133,7 +133,7 @@ class Rollouts(NamedTuple):
         Against an opponent it is enough that they stay in the residual set of the region of level `last`. With a catch
         set the motion is over: the states are those of t_N, and nothing is asked.
         """
-        if self.problem.catch is not None:
+        if self.problem.caught:
             return x, jnp.ones(x.shape[1:], bool)
         ends, peaks = self.at_goal(x, dynamics)
         before, after = self.level(x, self.intervals), self.level(ends, self.intervals)

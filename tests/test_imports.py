@@ -26,6 +26,7 @@ LAYERS = (
         "rollout",
         "validation",
         "funnel",
+        "reset",
         "evaluation",
         "refinement",
     },
@@ -39,7 +40,7 @@ LAYERS = (
 # The steps of the algorithm: each imports from those before it.
 STEPS = (
     "types", "problem", "genome", "trajectory", "policy", "adversary", "rollout", "validation", "funnel", "volume",
-    "evaluation", "refinement",
+    "reset", "evaluation", "refinement",
 )  # fmt: skip
 
 # Packages that only some modules may import.

@@ -9,7 +9,15 @@ from rtcd_jax.analysis.report.reading import Run, read_run
 from rtcd_jax.analysis.report.tables import Cell, candidate, gains, verdict
 from rtcd_jax.analysis.report.words import duration, guarantee, listed, ratio, volume_unit, words
 from rtcd_jax.config.load import Config, differences
-from rtcd_jax.elite.records import INITIAL, elite_names, read_config, read_elite, read_generations, task_folders
+from rtcd_jax.elite.records import (
+    INITIAL,
+    elite_names,
+    read_config,
+    read_elite,
+    read_generations,
+    resets_in_words,
+    task_folders,
+)
 from rtcd_jax.system.console import Console, table
 from rtcd_jax.system.errors import UserError
 from rtcd_jax.volume import VOLUMES
@@ -113,6 +121,7 @@ def show_run(path: Path, console: Console) -> Iterator[str]:
         first, last = _over_tasks(path, search.objective)
         over = f"{words(search.over_tasks)} over {len(course.config.tasks)} tasks"
         yield f"{words(search.objective)}, {over}: initial {first:.4g}, best {last:.4g} (sampled)"
+        yield from resets_in_words(read_elite(path / "elites", elite_names(path)[0])[1])
         for folder in task_folders(path):
             yield f"task {folder.name}:"
             yield from show_run(folder, console)

@@ -210,11 +210,15 @@ def _ends(task: TaskConfig, trajectory: TrajectoryConfig) -> Iterator[Problem]:
             yield Problem(("task", "goal", i), text, value)
 
 
-def _catch(task: TaskConfig, policy: PolicyConfig, search: SearchConfig) -> Iterator[Problem]:
+def _catch(
+    task: TaskConfig, policy: PolicyConfig, search: SearchConfig, uncertainty: UncertaintyConfig
+) -> Iterator[Problem]:
     if not task.caught:
         if policy.weighs_catch:
             yield Problem(("policy", "catch_weight"), "needs task.catch.half_widths: without a catch set it has no use")
         return
+    if task.catch.cyclic and not uncertainty.empty:
+        yield Problem(("uncertainty",), "must be empty with task.catch.reset: a reset is that of the exact model")
     if search.objective == GOAL:
         text = "must be another one with task.catch: at a goal that is no equilibrium there is no region"
         yield Problem(("search", "objective"), text, search.objective)

@@ -142,16 +142,36 @@ class KeepOutConfig(Settings):
 
 
 class CatchConfig(Settings):
-    """The set {x : (x - goal)' C (x - goal) <= 1}, C the diagonal of 1 / half width^2."""
+    """The set {x : (x - goal)' C (x - goal) <= 1}, C the diagonal of 1 / half width^2, or that of a reset."""
 
     half_widths: Widths = Field(
         default=(),
         description="of an ellipsoid about the goal in which the motion ends, that of all tasks; empty: the goal is an "
         f"equilibrium that is held [{UNIT}]",
     )
+    reset: Literal["none", "brachiation"] = Field(
+        default="none",
+        description="instead of half widths: the tasks are a cycle, each ends where this reset leads into the next "
+        "one's funnel; brachiation: the free hook takes the next bar, the other one lets go",
+    )
+
+    @model_serializer(mode="wrap")
+    def _of_its_kind(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        return {key: value for key, value in handler(self).items() if value and value != "none"}
+
+    @property
+    def cyclic(self) -> bool:
+        """Whether each task ends where the next one begins."""
+        return self.reset != "none"
+
+    def problems(self) -> Iterator[Problem]:
+        if self.half_widths and self.cyclic:
+            yield Problem(("reset",), "must be left away where there are half_widths: the one or the other", self.reset)
 
     def in_words(self, states: Mapping[str, str]) -> str:
-        """The half widths of states that are given with their units."""
+        """The half widths of states that are given with their units, or what the reset does."""
+        if self.cyclic:
+            return f"what the reset ({self.reset}) leads into the next task's first ellipsoid"
         widths = zip(states.items(), self.half_widths, strict=True)
         return ", ".join(f"{name} ± {width:.6g} {unit}" for (name, unit), width in widths)
 
@@ -182,7 +202,7 @@ class TaskConfig(Settings):
     @property
     def caught(self) -> bool:
         """Whether the motion ends in a catch set, and no time follows."""
-        return bool(self.catch.half_widths)
+        return bool(self.catch.half_widths or self.catch.cyclic)
 
     def problems(self) -> Iterator[Problem]:
         for i, limit in enumerate(self.state_limits):

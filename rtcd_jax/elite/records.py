@@ -15,7 +15,7 @@ Numbers that are not finite are stored as null.
 import hashlib
 import io
 import json
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -134,6 +134,15 @@ def require_held_goal(path: Path, verb: str) -> None:
     if (path / "format.json").is_file() and read_config(path).task.caught:
         raise UserError(
             f"{path} ends in a catch set (task.catch): rtcd {verb} needs a goal that is held after the motion"
+        )
+
+
+def resets_in_words(record: Record) -> Iterator[str]:
+    """Of what a cycle of tasks has in common: where each reset leads."""
+    for name, reset in record.get("reset", {}).items():
+        yield (
+            f"reset of {name} into {reset['into']}: the largest V/rho in the first ellipsoid there is "
+            f"{reset['largest_level']:.3g}, of {reset['samples']} samples of the last one here, and as many on its rim"
         )
 
 

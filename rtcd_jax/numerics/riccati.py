@@ -24,6 +24,9 @@ from rtcd_jax.numerics.batched import cholesky, mm, mtm, solve_lower, transpose
 SHORT = 1 / 32
 """Duration of a short interval over the time constant of the fastest mode: its third-order series is off by 5e-6."""
 
+PERIODIC = 1e-8
+"""Largest change of a periodic solution over one period, over its largest entry."""
+
 
 class Interval(NamedTuple):
     """The Hamiltonian flow over one time interval; `definite` is false where a factorization failed."""
@@ -71,6 +74,13 @@ def propagate(
     damped, definite = _damped(value, interval.spread)
     before = interval.cost + mtm(interval.transition, mm(damped, interval.transition))
     return _symmetric(before), definite & interval.definite
+
+
+def mapped(interval: Interval, jump: Float[Array, "n n *batch"]) -> Interval:
+    """The interval at whose end x jumps to J x, where no input acts and nothing is charged."""
+    return interval._replace(
+        transition=mm(jump, interval.transition), spread=_symmetric(mm(jump, mm(interval.spread, transpose(jump))))
+    )
 
 
 def short_interval(
@@ -133,6 +143,16 @@ def _fastest(a, spread, cost):
 
 def _double(interval: Interval, times: Int[Array, ""] | int) -> Interval:
     return jax.lax.fori_loop(0, times, lambda _, interval: compose(interval, interval), interval)
+
+
+def periodic(period: Interval, doublings: int = 10) -> tuple[Float[Array, "n n *batch"], Bool[Array, "*batch"]]:
+    """The stabilizing solution S = Q + A'S (I + G S)^-1 A at the start of a period without end, and whether it was
+    reached; it is not where what repeats cannot be stabilized.
+    """
+    value = _double(period, doublings).cost
+    before, definite = propagate(period, value)
+    reached = jnp.max(jnp.abs(before - value), (0, 1)) <= PERIODIC * jnp.max(jnp.abs(value), (0, 1))
+    return value, definite & reached
 
 
 def infinite_horizon(

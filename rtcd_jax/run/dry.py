@@ -47,7 +47,7 @@ def understood(problem: Problem) -> Iterator[str]:
         if still and fastest > AT_REST:
             kind = f"an unstable equilibrium, from which motions grow by {fastest:.3g} 1/s"
         yield f"{name:10} {state.tolist()}: {kind}"
-    if problem.catch is None:
+    if not problem.caught:
         a, b = linearized_goal(problem)
         blocks = [b]
         for _ in range(plant.n - 1):

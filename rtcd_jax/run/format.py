@@ -158,8 +158,27 @@ def common_record(problem: Problem, evaluation: TaskEvaluations) -> dict[str, An
         "over_tasks": config.search.over_tasks,
         "volumes": dict(host.volumes.named),
         "tasks": each,
+        **({} if host.after_reset is None else {"reset": _reset(problem, np.asarray(host.after_reset))}),
         "seed": config.search.seed,
         "config_hash": config_hash(config),
+    }
+
+
+def _reset(problem: Problem, after: np.ndarray) -> dict[str, Any]:
+    """By task: into which one the reset at its end leads, and the largest V / rho_0 there of so many samples; where all
+    are inside, the failure probability of a uniform state of the last ellipsoid is at most epsilon.
+    """
+    names, config = list(problem.config.tasks), problem.config
+    samples, statements = elite_budget(problem).samples_per_knot, len(names) * (config.elites.count + 1)
+    promise = epsilon(np.array([samples]), config.funnel.confidence, statements)
+    return {
+        name: {
+            "into": names[(i + 1) % len(names)],
+            "largest_level": float(level),
+            "samples": samples,
+            "epsilon": promise if level <= 1 else None,
+        }
+        for i, (name, level) in enumerate(zip(names, after, strict=True))
     }
 
 

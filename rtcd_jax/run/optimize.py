@@ -12,7 +12,7 @@ import numpy as np
 
 from rtcd_jax.config.load import Config
 from rtcd_jax.config.schema import REFINABLE, REFINEMENT_STEPS
-from rtcd_jax.elite.records import TASKS, Record, elite_names, read_generations
+from rtcd_jax.elite.records import TASKS, Record, elite_names, read_generations, resets_in_words
 from rtcd_jax.evaluation import device_chunk, make_evaluate
 from rtcd_jax.genome import initial_genome
 from rtcd_jax.problem import Problem, make_problem
@@ -206,6 +206,7 @@ def _over_tasks(problem: Problem, initial: TaskEvaluations, best: TaskEvaluation
     for name, first, last in rows:
         ratio = f"{last / first:9.2f}" if first > 0 else f"{'-':>9}"
         yield f"{name:24}{float(first):12.5g}{float(last):12.5g}{ratio}"
+    yield from resets_in_words(common_record(problem, best))
 
 
 def _tell(problem: Problem, elites: Sequence[Reported], initial: Reported, console: Console) -> None:

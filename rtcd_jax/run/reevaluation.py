@@ -16,6 +16,7 @@ import numpy as np
 
 from rtcd_jax.evaluation import compare_with_mjx, elite_budget, elite_key, over_tasks, resample
 from rtcd_jax.problem import Problem
+from rtcd_jax.reset import closed
 from rtcd_jax.search.archive import Records
 from rtcd_jax.system.cluster import Cluster
 from rtcd_jax.system.console import Console
@@ -87,7 +88,11 @@ class Reevaluation:
         if not self._problem.tasks:
             return parts[0]
         stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *parts)
-        return jax.device_get(over_tasks(stacked, self._problem.config.search.over_tasks))
+        whole = over_tasks(stacked, self._problem.config.search.over_tasks)
+        if self._problem.reset is not None:
+            key = jax.random.fold_in(self._key, self._elites.keys + 1)
+            whole = closed(self._problem, whole, key, self._budget.samples_per_knot)
+        return jax.device_get(whole)
 
     def report(self, elites: Sequence[Evaluation], initial: Evaluation) -> tuple[list[Reported], Reported]:
         """What is stored of the elites, best first, and of the initial candidate.

@@ -1,0 +1,92 @@
+"""Swing after swing of a cycle of tasks: states of the first ellipsoid, through all motions and the resets between.
+
+    python launch/bench/cycle.py RUN [--swings 8] [--states 1000] [--scale 1] [--figure FILE]
+
+Each task's best elite, in C MuJoCo by fixed Runge-Kutta steps, from uniform states of the first task's first ellipsoid
+(times `--scale` in radius). V/rho is the largest at the start of a swing; a state is out once it is outside of an
+ellipsoid at a knot, or beyond the limits at a step. The figure shows the first four swings of one state.
+"""
+
+import argparse
+import itertools
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from rtcd_jax.elite.closed_loop import ClosedLoop, fastest_rate, outside_limits, runge_kutta
+from rtcd_jax.elite.elite import Elite
+from rtcd_jax.elite.records import read_config, task_folders
+from rtcd_jax.elite.simulators import STEP_OF_FASTEST, STEPS, mujoco_of
+from rtcd_jax.problem import RESETS
+
+SHOWN, EVERY = 4, 5
+"""Swings of the figure, and which of the knots it shows."""
+
+
+def swing(elite: Elite, x: np.ndarray, out: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The states [N+1 S n] at the knots, and which of them are out of the funnel or were before."""
+    f = mujoco_of(elite, max(len(x), 2 * (elite.x_goal.size + elite.u_max.size)))
+    loop, step = ClosedLoop.of(elite, f), float(elite.time[1]) / STEPS
+    march = runge_kutta(f, min(step, STEP_OF_FASTEST / fastest_rate(elite, f)))
+    knots, out = [x], out | ~(elite.value(0, x) <= elite.rho[0])
+    for k, (begin, end) in enumerate(itertools.pairwise(elite.time)):
+        for after in march(loop.tracking(k), begin, end, knots[k]):
+            out = out | outside_limits(elite, after)
+        knots.append(after)
+        out = out | ~(elite.value(k + 1, after) <= elite.rho[k + 1])
+    return np.array(knots), out
+
+
+def draw(motions: list[np.ndarray], arm: float, file: Path) -> None:
+    """Both arms of one state's `motions` [N+1 n], bar after bar; an arm keeps its color."""
+    import matplotlib.pyplot as plt
+
+    figure, axes = plt.subplots(figsize=(10, 3.2))
+    bar = 0.0
+    for number, knots in enumerate(motions):
+        joints = [np.full((len(knots), 2), [bar, 0.0])]
+        for angle in (knots[:, 0], knots[:, 0] + knots[:, 1]):
+            joints.append(joints[-1] + arm * np.stack([np.sin(angle), -np.cos(angle)], 1))
+        colors = ("tab:blue", "tab:red") if number % 2 == 0 else ("tab:red", "tab:blue")
+        for (start, end), color in zip(itertools.pairwise(joints), colors, strict=True):
+            lines = np.stack([start, end])[:, ::EVERY]
+            axes.plot(lines[..., 0], lines[..., 1], color=color, alpha=0.35, linewidth=1.2)
+        axes.plot(*joints[2].T, color="0.3", linewidth=0.8)
+        axes.plot(bar, 0, "ko", markersize=5)
+        bar = joints[2][-1, 0]
+    axes.plot(bar, 0, "ko", markersize=5)
+    axes.set(aspect="equal", xlabel="x [m]", ylabel="z [m]")
+    figure.savefig(file, dpi=100, bbox_inches="tight")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("run", type=Path)
+    parser.add_argument("--swings", type=int, default=8)
+    parser.add_argument("--states", type=int, default=1000)
+    parser.add_argument("--scale", type=float, default=1.0)
+    parser.add_argument("--figure", type=Path)
+    options = parser.parse_args()
+    jax.config.update("jax_enable_x64", True)
+    folders = task_folders(options.run)
+    elites = [Elite.read(folder, 0) for folder in folders]
+    _, reset = RESETS[read_config(options.run).task.catch.reset]
+    x = elites[0].points(np.zeros(options.states, int), np.random.default_rng(0))
+    x = elites[0].x[0] + options.scale * (x - elites[0].x[0])
+    out, motions = np.zeros(len(x), bool), []
+    print("| swing | task | duration [s] | largest V/rho at its start | states out |\n|---|---|---|---|---|")
+    for number in range(options.swings):
+        name, elite = folders[number % len(elites)].name, elites[number % len(elites)]
+        level = elite.value(0, x).max() / elite.rho[0]
+        knots, out = swing(elite, x, out)
+        motions.append(knots[:, 0])
+        print(f"| {number + 1} | {name} | {elite.time[-1]:.3g} | {level:.3g} | {out.sum()} of {len(out)} |")
+        x = np.asarray(reset(elite.parameters, jnp.asarray(knots[-1].T))).T
+    if options.figure:
+        draw(motions[:SHOWN], elites[0].parameters["arm_length"], options.figure)
+
+
+if __name__ == "__main__":
+    main()

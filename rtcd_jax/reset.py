@@ -1,0 +1,87 @@
+"""A cycle of tasks: each motion ends where a reset carries it into the start of the next one, the last into the first.
+
+    S_N = DR' S_0 DR,   S_0 of the next task,   all around the cycle: to first order V does not rise at a reset
+
+The reset R acts on the whole last ellipsoid, and it is not linear: a cycle is closed if held-out samples of every last
+ellipsoid, and as many on its rim, lie in the next task's first one. Then a state of any funnel stays in the funnels
+from swing to swing.
+"""
+
+import dataclasses
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from rtcd_jax.numerics import riccati, sampling
+from rtcd_jax.numerics.batched import mm, mtm
+from rtcd_jax.numerics.derivatives import jacobian
+from rtcd_jax.numerics.ellipsoid import Ellipsoids
+from rtcd_jax.policy import riccati_intervals
+from rtcd_jax.problem import Problem
+from rtcd_jax.types import Candidate, Evaluation, Status, TaskEvaluations, Trajectory, first_failure
+
+
+def values_at_resets(problem: Problem, candidates: Candidate, trajectories: Trajectory) -> Float[Array, "tasks n n"]:
+    """S_N of one genome's candidates and trajectories [T] on every task; no numbers where the periodic Riccati equation
+    has no stabilizing solution.
+    """
+
+    def swing(candidate: Candidate, trajectory: Trajectory):
+        own = problem.of(candidate)
+        stages = riccati_intervals(own, candidate, trajectory)
+        last, others = jax.tree.map(lambda leaf: leaf[-1], stages), jax.tree.map(lambda leaf: leaf[:-1], stages)
+        whole, _ = jax.lax.scan(lambda late, early: (riccati.compose(early, late), None), last, others, reverse=True)
+        return whole, jacobian(partial(_reset, problem, candidate), trajectory.xs[-1])
+
+    swings, jumps = jax.vmap(swing)(candidates, trajectories)
+    jumped = jax.vmap(riccati.mapped)(swings, jumps)
+    first, later = jax.tree.map(lambda leaf: leaf[0], jumped), jax.tree.map(lambda leaf: leaf[1:], jumped)
+    period, _ = jax.lax.scan(lambda early, late: (riccati.compose(early, late), None), first, later)
+    start, reached = riccati.periodic(period)
+
+    def backward(start, at):
+        swing, jump = at
+        last = mtm(jump, mm(start, jump))
+        return riccati.propagate(swing, last)[0], last
+
+    _, lasts = jax.lax.scan(backward, start, (swings, jumps), reverse=True)
+    return jnp.where(reached, lasts, jnp.nan)
+
+
+def closed(
+    problem: Problem, evaluations: TaskEvaluations, key: PRNGKeyArray, samples: int, share: float = 1.0
+) -> TaskEvaluations:
+    """One genome's evaluations with what their resets do; FUNNEL_EMPTY where one of them leads out of the next task's
+    first ellipsoid, or out of this `share` of its level.
+    """
+    after = largest_after_reset(problem, evaluations.tasks, key, samples)
+    leaves = jnp.where(jnp.all(after <= share), Status.OK, Status.FUNNEL_EMPTY)
+    status = first_failure(evaluations.status, leaves)
+    return dataclasses.replace(evaluations, status=status, after_reset=after)
+
+
+def largest_after_reset(problem: Problem, tasks: Evaluation, key: PRNGKeyArray, samples: int) -> Float[Array, " tasks"]:
+    """Of one genome's evaluations [T]: the largest V / rho_0 in the next task's first ellipsoid, at most 1 if the cycle
+    is closed there, of `samples` states that are uniform in each last one, and as many on its rim, after the reset.
+    """
+    policies = tasks.funnel.policy
+    count, _, n = policies.trajectory.xs.shape
+
+    def sets(knot: int) -> Ellipsoids:
+        return Ellipsoids.about(policies.trajectory.xs[:, knot].T, jnp.moveaxis(policies.values[:, knot], 0, -1))
+
+    y = sampling.ball(key, (count, samples), n, tasks.funnel.levels.dtype)
+    y = jnp.concatenate([y, y / jnp.sqrt(jnp.sum(y**2, 0))], -1)
+    radii = jnp.sqrt(tasks.funnel.levels[:, -1])[:, None]
+    ends = sets(-1).points(jnp.broadcast_to(radii, y.shape[1:]), y)
+    starts = jnp.roll(jax.vmap(partial(_reset, problem), (0, 1), 1)(tasks.candidate, ends), 1, 1)
+    levels = sets(0).level(starts) / tasks.funnel.levels[:, 0][:, None]
+    return jnp.roll(jnp.max(jnp.where(jnp.isnan(levels), jnp.inf, levels), -1), -1)
+
+
+def _reset(problem: Problem, candidate: Candidate, x: Float[Array, "n *batch"]) -> Float[Array, "n *batch"]:
+    """R of states at the end of the candidate's task, with its robot's numbers."""
+    assert problem.reset is not None
+    return problem.reset(vars(problem.of(candidate).plant) | vars(candidate.design), x)

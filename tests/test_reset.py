@@ -1,0 +1,181 @@
+"""Cycles of tasks: values around resets against linear algebra, and which cycles are closed."""
+
+import dataclasses
+from functools import cache
+from typing import final
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.linalg
+
+from rtcd_jax.config.load import load, parse, resolved
+from rtcd_jax.elite.closed_loop import ClosedLoop, outside_limits, runge_kutta
+from rtcd_jax.elite.elite import Elite
+from rtcd_jax.elite.simulators import mujoco_of
+from rtcd_jax.evaluation import make_evaluate, over_tasks
+from rtcd_jax.genome import initial_genome
+from rtcd_jax.plants import brachiation
+from rtcd_jax.problem import initial_design, make_problem
+from rtcd_jax.reset import closed, values_at_resets
+from rtcd_jax.run.format import arrays_of, common_record, record_of
+from rtcd_jax.run.reevaluation import row
+from rtcd_jax.system.errors import ConfigError, UserError
+from rtcd_jax.types import Evaluation, Funnel, Status, Volumes
+from tests import linear_system as linear
+from tests.paths import CONFIGS
+
+JUMP = np.array([[0.9, 0.3], [-0.2, 1.6]])
+MOTIONS = [linear.policy(us, 0.05).trajectory for us in ([3.0, -2.0, 1.0], [-1.0, 0.5, 2.0])]
+
+
+@final
+class Deaf(linear.Equations):
+    """x1'' = 4 x1, whatever the input."""
+
+    limit: float = linear.UNBOUNDED
+    state_names = ("position", "speed")
+    state_units = ("m", "m/s")
+
+    def dynamics(self, design, x, u):
+        return jnp.stack([x[1], 4 * x[0] + 0 * u[0]])
+
+
+def _linear(**changes):
+    problem = linear.problem_of([1e6, 1e6], intervals=3)
+    return dataclasses.replace(problem, reset=lambda numbers, x: JUMP @ x, **changes)
+
+
+def _stacked(trees):
+    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *trees)
+
+
+def _values(problem):
+    return values_at_resets(problem, _stacked([linear.candidate()] * 2), _stacked(MOTIONS))
+
+
+def _expected():
+    """S_N = J' S J with S = Y X^-1 of the stable subspace [X; Y] of the flow of state and costate over one period."""
+    r = linear.B @ np.linalg.solve(linear.R, linear.B.T)
+    hamiltonian = np.block([[linear.A, -r], [-linear.Q, -linear.A.T]])
+    jump = scipy.linalg.block_diag(JUMP, np.linalg.inv(JUMP).T)
+    monodromy = np.linalg.matrix_power(np.asarray(jump) @ scipy.linalg.expm(hamiltonian * 0.15), 2)
+    basis = scipy.linalg.schur(monodromy, sort="iuc")[1]
+    start = basis[2:, :2] @ np.linalg.inv(basis[:2, :2])
+    return start, JUMP.T @ start @ JUMP
+
+
+def test_values_are_those_of_the_dense_periodic_riccati_equation():
+    np.testing.assert_allclose(_values(_linear()), [_expected()[1]] * 2, rtol=1e-6)
+
+
+def test_what_no_input_reaches_has_no_values():
+    assert np.isnan(_values(_linear(plant=Deaf()))).all()
+
+
+def _evaluations(levels):
+    """Those of one genome on two tasks at rest, with the periodic shapes and these first and last levels."""
+    start, last = _expected()
+    evaluations = []
+    for first_level, last_level in levels:
+        policy = dataclasses.replace(linear.policy([0.0] * 3, 0.05), values=jnp.stack([start, start, last, last]))
+        funnel = Funnel(policy, jnp.array([first_level, 1.0, 1.0, last_level]), jnp.ones(4, int), policy.status)
+        volumes = Volumes(jnp.ones(4), {"sum": jnp.ones(())})
+        evaluations.append(Evaluation(jnp.zeros(1), linear.candidate(), funnel, volumes, policy.status))
+    return over_tasks(_stacked(evaluations), "min")
+
+
+@pytest.mark.parametrize(
+    ("levels", "status"), [([(2, 1), (4, 1.5)], Status.OK), ([(2, 1), (4, 2.1)], Status.FUNNEL_EMPTY)]
+)
+def test_with_periodic_values_a_linear_reset_keeps_v(levels, status):
+    """Each last rim is carried onto the level rho_N in the next task, whose first ellipsoid is at rho_0."""
+    found = closed(_linear(), _evaluations(levels), jax.random.key(0), 50)
+    expected = [levels[0][1] / levels[1][0], levels[1][1] / levels[0][0]]
+    np.testing.assert_allclose(np.asarray(found.after_reset), expected, rtol=1e-9)
+    assert found.status == status
+
+
+# ---- AcroMonk
+
+
+def _changed(**sections):
+    data = resolved(load(CONFIGS / "acromonk_cycle.yaml"))
+    for section, keys in sections.items():
+        data[section] = data.get(section, {}) | keys
+    return data
+
+
+@cache
+def problem():
+    return make_problem(parse(_changed()))
+
+
+@cache
+def evaluated():
+    one = jax.jit(make_evaluate(problem()))(jnp.asarray(initial_genome(problem()))[None], jax.random.key(0))
+    return row(one, 0)
+
+
+def test_the_second_swing_is_that_of_the_robot_with_exchanged_arms():
+    first, second = (vars(alone.plant) | vars(initial_design(alone)) for alone in problem().tasks)
+    after = brachiation.exchanged(first)
+    assert {name: float(second[name]) for name in after} == pytest.approx({k: float(v) for k, v in after.items()})
+
+
+WRONG = {
+    "both kinds of end": (
+        {"task": {"catch": {"reset": "brachiation", "half_widths": [1, 1, 1, 1]}}},
+        r"task\.catch\.reset = 'brachiation': must be left away where there are half_widths",
+    ),
+    "an uncertain robot": ({"uncertainty": {"input": 0.1}}, r"uncertainty: must be empty with task\.catch\.reset"),
+    "another start": (
+        {"task": {"start": [-0.5, -2, 0, 0]}},
+        r"tasks\.light_holds\.start = \[-0\.5, .*: must be \[-0\.572082\d+, -1\.99742\d+, .*end of heavy_holds",
+    ),
+    "another robot": (
+        {"tasks": {"light_holds": {"plant": {"support_mass": "swing_mass"}}}},
+        r"tasks\.light_holds\.plant\.support_center = 0\.23347: must be 0\.189234, what it is after the reset",
+    ),
+}
+
+
+@pytest.mark.parametrize(("changes", "text"), [pytest.param(*case, id=name) for name, case in WRONG.items()])
+def test_what_is_no_cycle_is_refused(changes, text):
+    with pytest.raises(ConfigError, match=text):
+        make_problem(parse(_changed(**changes)))
+
+
+def test_a_cycle_needs_tasks():
+    data = _changed()
+    del data["tasks"]
+    with pytest.raises(UserError, match="it needs `tasks`"):
+        make_evaluate(make_problem(parse(data)))
+
+
+@pytest.mark.slow
+def test_the_robot_that_was_built_closes_its_cycle_and_stays_in_the_funnels_for_eight_swings():
+    """From uniform states of the first ellipsoid, in C MuJoCo, with the reset between the swings."""
+    whole = evaluated()
+    assert whole.status == Status.OK
+    assert np.all(whole.after_reset <= 1)
+    record = common_record(problem(), whole)["reset"]
+    assert [each["into"] for each in record.values()] == ["light_holds", "heavy_holds"]
+    elites = []
+    for task, alone in enumerate(problem().tasks):
+        one = row(whole.tasks, task)
+        stored = jax.tree.map(lambda leaf: np.asarray(leaf).tolist(), record_of(alone, one))
+        elites.append(Elite.of(arrays_of(alone, one), stored))
+    x = elites[0].points(np.zeros(100, int), np.random.default_rng(0))
+    for swing in range(8):
+        elite = elites[swing % 2]
+        assert np.all(elite.value(0, x) <= elite.rho[0])
+        f = mujoco_of(elite, 200)
+        march, loop = runge_kutta(f, float(elite.time[1]) / 4), ClosedLoop.of(elite, f)
+        for k, (begin, end) in enumerate(zip(elite.time[:-1], elite.time[1:], strict=True)):
+            for after in march(loop.tracking(k), begin, end, x):
+                assert not outside_limits(elite, after).any()
+                x = after
+        assert np.all(elite.value(len(elite.u), x) <= elite.rho[-1])
+        x = np.asarray(brachiation.catch(elite.parameters, jnp.asarray(x.T))).T
