@@ -24,7 +24,7 @@ from rtcd_jax.analysis.disturb.experiments import (
 )
 from rtcd_jax.analysis.disturb.figures import draw_disturbance
 from rtcd_jax.analysis.disturb.scenarios import Outcome, Rollouts
-from rtcd_jax.elite.records import require_held_goal
+from rtcd_jax.elite.records import require_elites, require_held_goal
 from rtcd_jax.system.console import Console
 from rtcd_jax.system.devices import require_devices
 from rtcd_jax.system.files import make_folder, replace_json
@@ -38,8 +38,9 @@ def disturb_run(folder: Path, states: int, seed: int, console: Console) -> None:
             read or written, or other devices than JAX_PLATFORMS or Slurm says.
     """
     require_devices()
-    comparison = read_comparison(folder, console)
+    require_elites(folder)
     require_held_goal(folder, "disturb")
+    comparison = read_comparison(folder, console)
     place = folder / "disturbance"
     make_folder(place)
     meter = Meter(console, _all_motions(comparison, states))
