@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -30,8 +31,18 @@ DESIGNS, STATES, LARGEST_STATE = 3, 8, 10.0
 
 SAME = 1e-9
 """Largest relative difference of two numbers of a robot that should be one."""
-RESETS = {"brachiation": (brachiation.exchanged, brachiation.catch)}
-"""By the name in the configuration: what becomes of the robot's numbers, and of its state."""
+
+
+class Reset(NamedTuple):
+    """The numbers of a robot that it needs; what becomes of them, and of the state [n *batch]."""
+
+    fields: tuple[str, ...]
+    numbers: Callable[..., dict[str, Any]]
+    state: Callable[..., Array]
+
+
+RESETS = {"brachiation": Reset(brachiation.FIELDS, brachiation.exchanged, brachiation.catch)}
+"""By the name in the configuration."""
 
 
 @dataclass(frozen=True)
@@ -164,7 +175,7 @@ def _make_problem(config: Config, path: tuple[str, ...]) -> Problem:
         keep_out=_keep_out(config),
         uncertainty=_uncertainty(config),
         catch=np.diag(1 / np.square(task.catch.half_widths)) if task.catch.half_widths else None,
-        reset=RESETS[task.catch.reset][1] if task.catch.cyclic else None,
+        reset=RESETS[task.catch.reset].state if task.catch.cyclic else None,
         cost_center=np.array(task.cost_center, float) if task.cost_center else None,
     )
     if not problem.caught:
@@ -275,21 +286,21 @@ def _require_stabilizable(problem: Problem, path: tuple[str, ...]) -> None:
 
 def _require_cycle(problem: Problem) -> None:
     """Every task's end and robot after the reset must be the start and the robot of the next one, of all designs."""
-    after, reset = RESETS[problem.config.task.catch.reset]
+    reset = RESETS[problem.config.task.catch.reset]
     names = list(problem.config.tasks)
     for share in (0.0, *np.random.default_rng(0).random(DESIGNS)):
         robots = [vars(alone.plant) | vars(_design(alone, share)) for alone in problem.tasks]
         for i, (alone, robot) in enumerate(zip(problem.tasks, robots, strict=True)):
-            if missing := [name for name in brachiation.FIELDS if name not in robot]:
-                text = f"needs a robot with {', '.join(brachiation.FIELDS)}; there is no {', '.join(missing)}"
+            if missing := [name for name in reset.fields if name not in robot]:
+                text = f"needs a robot with {', '.join(reset.fields)}; there is no {', '.join(missing)}"
                 raise ConfigError([Fault(("task", "catch", "reset"), text, problem.config.task.catch.reset)])
             following = (i + 1) % len(names)
             path, behind = ("tasks", names[following]), f"after the reset at the end of {names[i]}"
-            for name, value in after(robot).items():
+            for name, value in reset.numbers(robot).items():
                 if abs(float(value) - float(robots[following][name])) > SAME * abs(float(value)):
                     text = f"must be {float(value):.9g}, what it is {behind}"
                     raise ConfigError([Fault((*path, "plant", name), text, float(robots[following][name]))])
-            start, expected = problem.tasks[following].start, np.asarray(reset(robot, jnp.asarray(alone.goal)))
+            start, expected = problem.tasks[following].start, np.asarray(reset.state(robot, jnp.asarray(alone.goal)))
             if np.max(np.abs(start - expected)) > AT_REST:
                 text = f"must be {expected.round(9).tolist()}, where the motion is {behind}"
                 raise ConfigError([Fault((*path, "start"), text, start.tolist())])

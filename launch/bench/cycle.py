@@ -72,7 +72,7 @@ def main() -> None:
     jax.config.update("jax_enable_x64", True)
     folders = task_folders(options.run)
     elites = [Elite.read(folder, 0) for folder in folders]
-    _, reset = RESETS[read_config(options.run).task.catch.reset]
+    reset = RESETS[read_config(options.run).task.catch.reset].state
     x = elites[0].points(np.zeros(options.states, int), np.random.default_rng(0))
     x = elites[0].x[0] + options.scale * (x - elites[0].x[0])
     out, motions = np.zeros(len(x), bool), []

@@ -7,6 +7,7 @@ more than it needs, the interval is proved once more with a lower decay margin.
 """
 
 from collections.abc import Iterator
+from functools import cache
 from typing import Any, NamedTuple, cast, final
 
 import numpy as np
@@ -50,9 +51,18 @@ class Tier(NamedTuple):
     degree: int
     further: bool = False
 
-    def further_monomials(self, loop: Loop) -> program.Monomials:
-        """Beyond the degree."""
-        return program.of_the_angles(loop.n, len(loop.hinges), self.degree) if self.further else ()
+    def shapes(self, todo: dict[str, Obligation], loop: Loop, fewest: int) -> dict[str, list[Shape]]:
+        """Of the programs of each case, the cheapest first: of every degree from `fewest` on, then the tier's own."""
+        further = program.of_the_angles(loop.n, len(loop.hinges), self.degree) if self.further else ()
+        lower = [(degree, ()) for degree in range(fewest, self.degree + self.further)]
+        sizes: list[tuple[int, program.Monomials]] = [*lower, (self.degree, further)]
+        return {
+            case: [
+                program.shape_of(each, degree, self.time_order, MULTIPLIER if each.where else 0, monomials)
+                for degree, monomials in sizes
+            ]
+            for case, each in todo.items()
+        }
 
 
 TIERS = {
@@ -177,25 +187,15 @@ class BackwardProof:
     def _models(
         self, interval: Interval, decay_margin: float
     ) -> tuple[Interval, dict[str, Obligation], dict[str, list[Shape]]]:
-        """The interval's obligations by the cheapest Taylor models that are good enough, and the shapes of their
-        programs, the cheapest first.
+        """The interval's obligations by the cheapest Taylor models that are good enough, or the richest, and the shapes
+        of their programs.
         """
-        *cheaper, last = TIERS[self.claim.n]
-        for tier in (*cheaper, last):
+        for tier in TIERS[self.claim.n]:
             interval = interval._replace(orders=(tier.time_order, tier.order))
             todo = check.funnel_obligations(self.claim, interval, "interval")
             if max(float(each.error) for each in todo.values()) <= ERROR_FRACTION * decay_margin:
                 break
-        sizes: list[tuple[int, program.Monomials]] = [
-            (degree, ()) for degree in range(FEWEST, tier.degree + tier.further)
-        ]
-        sizes.append((tier.degree, tier.further_monomials(self.loop)))
-        shapes = {
-            case: [program.shape_of(each, degree, tier.time_order, MULTIPLIER if each.where else 0, further)
-                   for degree, further in sizes]
-            for case, each in todo.items()
-        }  # fmt: skip
-        return interval, todo, shapes
+        return interval, todo, tier.shapes(todo, self.loop, FEWEST)
 
 
 def prove(
@@ -215,10 +215,12 @@ def prove(
         Refused: the checker does not accept a certificate of the solver's.
     """
 
-    def lowest(case: str, shape: Shape) -> float:
-        return program.lowest(program.data_of(todo[case], shape), shape, directions)
+    @cache
+    def sampled(case: str, shape: Shape) -> tuple[program.Data, float]:
+        data = program.data_of(todo[case], shape)
+        return data, program.lowest(data, shape, directions)
 
-    hardest = {case: lowest(case, shapes[case][-1]) for case in todo}
+    hardest = {case: sampled(case, shapes[case][-1])[1] for case in todo}
     if min(hardest.values()) <= 0:
         return None
     certificates, least = {}, np.inf
@@ -226,8 +228,9 @@ def prove(
         solution = None
         for shape in shapes[case]:
             needed = 0 if shape is shapes[case][-1] else enough
-            if lowest(case, shape) > needed:
-                solution = program.solve(program.data_of(todo[case], shape), shape, solver)
+            data, lowest = sampled(case, shape)
+            if lowest > needed:
+                solution = program.solve(data, shape, solver)
                 if solution is not None and solution.margin > needed:
                     break
         if solution is None:

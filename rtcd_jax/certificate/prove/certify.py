@@ -32,6 +32,8 @@ from rtcd_jax.system.journal import Journal
 
 TASK = "task"
 """Note of a certificate: the digest of what was to be proved, and how."""
+ENDING_ZEROS = re.compile(r"\.?0*p")
+"""Of a double as certificates write it."""
 COARSER = 2
 """Stride of the directions for funnels that are not proved yet."""
 
@@ -56,9 +58,6 @@ class Checking(NamedTuple):
     elite: str
     done: int
     of: int
-
-
-_ZEROS = re.compile(r"\.?0*p")
 
 
 class Outcome(NamedTuple):
@@ -324,4 +323,4 @@ def _matrix(matrix: list[list]) -> Any:
 
 def _triangle(matrix: list[list]) -> list[str]:
     """Without the zeros that end most numbers on the grid: these are most of a file."""
-    return [_ZEROS.sub("p", double(float(c))) for i, row in enumerate(matrix) for c in row[i:]]
+    return [ENDING_ZEROS.sub("p", double(float(c))) for i, row in enumerate(matrix) for c in row[i:]]

@@ -6,10 +6,10 @@ import numpy as np
 
 from rtcd_jax.certificate import check
 from rtcd_jax.certificate.check import Claim, Refused, Shell
-from rtcd_jax.certificate.prove.backward import MULTIPLIER, Tier, prove
+from rtcd_jax.certificate.prove.backward import Tier, prove
 from rtcd_jax.certificate.prove.closed_loop import Loop, on_grid
 from rtcd_jax.certificate.prove.levels import goal_level, unit_directions
-from rtcd_jax.certificate.prove.sdp import SOLVER, shape_of
+from rtcd_jax.certificate.prove.sdp import SOLVER
 
 LEVEL_FRACTIONS = (1.0, 0.995, 0.985, 0.97, 0.95, 0.92, 0.88, 0.83, 0.77, 0.7, 0.6, 0.5, 0.35, 0.2, 0.1)
 """Fractions of the level that the samples allow, in the order of trial."""
@@ -71,11 +71,10 @@ def _at_level(
 ) -> tuple[GoalRegion | None, float]:
     """The region of a level, and the error [1/s] of its models."""
     axes = on_grid(loop.axes(len(loop.u) - 1, 1.0, rho, 0.0)[0])
-    order, degree, further = tier.order, tier.degree, tier.further_monomials(loop)
     waiting, shells, least, rest, error = [(0.0, 1.0)], [], np.inf, 0.0, np.inf
     try:
         late = loop.goal_late_row() if claim.first_order else []
-        field = check.goal_field(claim, axes, order, "goal", late)
+        field = check.goal_field(claim, axes, tier.order, "goal", late)
         while waiting:  # from the outside in
             start, end = waiting.pop()
             ends = check.rational(start), check.rational(end)
@@ -83,13 +82,7 @@ def _at_level(
             if start or not claim.moves_the_goal:
                 todo = check.goal_obligations(claim, field, *ends)
                 error = max(float(each.error) for each in todo.values())
-                shapes = {
-                    case: [
-                        shape_of(each, degree, tier.time_order, MULTIPLIER if each.where else 0, monomials)
-                        for monomials in dict.fromkeys(((), further))
-                    ]
-                    for case, each in todo.items()
-                }
+                shapes = tier.shapes(todo, loop, tier.degree)
                 proof = prove(todo, shapes, ENOUGH, exact, directions, solver)
             if proof is not None:
                 shells.append(Shell(*ends, proof[0]))
@@ -105,4 +98,4 @@ def _at_level(
     except Refused:
         return None, error
     outlet, sides = (1 - OUTLET_CLEARANCE) * rho, loop.goal_sides()
-    return GoalRegion(rho, outlet, axes, order, rest, shells[::-1], least, late, sides), error
+    return GoalRegion(rho, outlet, axes, tier.order, rest, shells[::-1], least, late, sides), error

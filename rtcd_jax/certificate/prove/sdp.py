@@ -201,10 +201,10 @@ class Program:
         sums: list[Any] = [gram @ cp.vec(each, order="C") + t * np.eye(size)[0] for each in self._gram]
         for g, multipliers in zip(self._g, self._multipliers, strict=True):
             for a, sigma in enumerate(multipliers):
-                products = cp.reshape(sides @ cp.vec(sigma, order="C"), (size, side), order="F") @ g.T
+                weighted = cp.reshape(sides @ cp.vec(sigma, order="C"), (size, side), order="F") @ g.T
                 for b in range(rest + 1):
                     weight = math.comb(high, a) * math.comb(rest, b) / math.comb(high + rest, a + b)
-                    sums[a + b] += weight * products[:, b]
+                    sums[a + b] += weight * weighted[:, b]
         self._shape = shape
         self.problem = cp.Problem(cp.Maximize(t), [each == self._p[j] for j, each in enumerate(sums)])
 
