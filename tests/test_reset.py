@@ -151,6 +151,13 @@ def test_a_cycle_needs_tasks():
     data = _changed()
     del data["tasks"]
     with pytest.raises(UserError, match="it needs `tasks`"):
+        parse(data)
+
+
+def test_a_cycle_of_one_task_is_not_searched():
+    data = _changed()
+    del data["tasks"]["light_holds"]
+    with pytest.raises(UserError, match="it needs `tasks`"):
         make_evaluate(make_problem(parse(data)))
 
 

@@ -211,12 +211,18 @@ def _ends(task: TaskConfig, trajectory: TrajectoryConfig) -> Iterator[Problem]:
 
 
 def _catch(
-    task: TaskConfig, policy: PolicyConfig, search: SearchConfig, uncertainty: UncertaintyConfig
+    task: TaskConfig,
+    tasks: dict[str, TaskChanges],
+    policy: PolicyConfig,
+    search: SearchConfig,
+    uncertainty: UncertaintyConfig,
 ) -> Iterator[Problem]:
     if not task.caught:
         if policy.weighs_catch:
             yield Problem(("policy", "catch_weight"), "needs task.catch.half_widths: without a catch set it has no use")
         return
+    if task.catch.cyclic and not tasks:
+        yield Problem(("task", "catch", "reset"), "leads from task to task: it needs `tasks`, two at least")
     if task.catch.cyclic and not uncertainty.empty:
         yield Problem(("uncertainty",), "must be empty with task.catch.reset: a reset is that of the exact model")
     if search.objective == GOAL:
