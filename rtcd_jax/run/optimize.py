@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from rtcd_jax.config.load import Config
@@ -22,7 +21,7 @@ from rtcd_jax.run.folder import RunFolder
 from rtcd_jax.run.format import arrays_of, common_arrays, common_record, record_of
 from rtcd_jax.run.reevaluation import Reevaluation, Reported, parts_of, physics_line, row
 from rtcd_jax.run.refine import PARTIAL, PartialState, refine_elites
-from rtcd_jax.run.sharding import Sharded, sharded
+from rtcd_jax.run.sharding import Sharded, ShardedEvaluate
 from rtcd_jax.run.tasks import store_task
 from rtcd_jax.search import search
 from rtcd_jax.search.archive import Elites, cost, shortfall
@@ -47,11 +46,10 @@ def optimize(config: Config, folder: Path, console: Console, cluster: Cluster, l
     problem = make_problem(config)
     share = -(-config.search.population // len(cluster.devices))
     chunk = device_chunk(problem, share, cluster.memory)
-    evaluate = sharded(make_evaluate(problem), cluster, chunk)
+    evaluate = ShardedEvaluate(make_evaluate(problem), cluster, chunk)
     first, tasks = tuple(initial_genome(problem).tolist()), tuple(config.tasks if problem.tasks else ())
     plan = search.Plan(config.search, config.elites, first, problem.design_dims, tasks)
-    genomes = jnp.zeros((config.search.population, len(problem.free)))
-    example = jax.eval_shape(make_evaluate(problem), genomes, jax.random.key(0))
+    example = evaluate.example(len(problem.free))
     with RunFolder.open(folder, config, cluster) as run:
         begun = run.restore(search.start(plan, example))
         for note in run.notes:

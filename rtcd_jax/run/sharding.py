@@ -56,29 +56,37 @@ class Sharded:
         return records
 
 
-def sharded(
-    evaluate: Evaluate, cluster: Cluster, chunk: int
-) -> Callable[[Float[Array | np.ndarray, "P d"], Key], Sharded]:
+@final
+class ShardedEvaluate:
     """`evaluate` for populations of any size, `chunk` candidates on every device of the cluster at a time.
 
     The genomes are process 0's. The last chunks are filled up with copies of the last genome. Between chunks the
     cluster checks whether it was asked to stop, and raises Preempted.
     """
-    size = chunk * len(cluster.devices)
-    on_devices = cluster.shared(lambda genomes, key: evaluate(genomes, jax.random.wrap_key_data(key)))
-    fetch = partial(_fetch, cluster, cluster.shared(partial(_rows, chunk)), chunk)
 
-    def evaluate_all(genomes: Float[Array | np.ndarray, "P d"], key: Key[Array, ""]) -> Sharded:
-        genomes = cluster.agreed(np.asarray(genomes))
+    def __init__(self, evaluate: Evaluate, cluster: Cluster, chunk: int):
+        self._cluster, self._size = cluster, chunk * len(cluster.devices)
+        self._on_devices = cluster.shared(lambda genomes, key: evaluate(genomes, jax.random.wrap_key_data(key)))
+        self._fetch = partial(_fetch, cluster, cluster.shared(partial(_rows, chunk)), chunk)
+
+    def example(self, dims: int) -> Records:
+        """The shapes of what all devices evaluate at a time, of genomes [P d] with d = `dims`. The program is traced,
+        which the first call then does not.
+        """
+        return self._on_devices.trace(*self._arguments(np.zeros((self._size, dims)), jax.random.key(0))).out_info
+
+    def __call__(self, genomes: Float[Array | np.ndarray, "P d"], key: Key[Array, ""]) -> Sharded:
+        genomes = self._cluster.agreed(np.asarray(genomes))
         count = len(genomes)
-        padded = np.concatenate([genomes, np.repeat(genomes[-1:], -count % size, 0)])
-        whole = cluster.replicated(jax.random.key_data(key))
-        parts = [on_devices(cluster.split(part), whole) for part in np.split(padded, len(padded) // size)]
-        summaries = [_summary(cluster, part) for part in parts]
+        padded = np.concatenate([genomes, np.repeat(genomes[-1:], -count % self._size, 0)])
+        chunks = np.split(padded, len(padded) // self._size)
+        parts = [self._on_devices(*self._arguments(part, key)) for part in chunks]
+        summaries = [_summary(self._cluster, part) for part in parts]
         status, volumes, borne, tasks = jax.tree.map(lambda *leaves: np.concatenate(leaves)[:count], *summaries)
-        return Sharded(genomes, status, volumes, borne, tasks, tuple(parts), fetch)
+        return Sharded(genomes, status, volumes, borne, tasks, tuple(parts), self._fetch)
 
-    return evaluate_all
+    def _arguments(self, genomes: Float[np.ndarray, "P d"], key: Key[Array, ""]) -> tuple[Array, Array]:
+        return self._cluster.split(genomes), self._cluster.replicated(jax.random.key_data(key))
 
 
 def _summary(cluster: Cluster, part: Records) -> tuple[np.ndarray, Volumes, np.ndarray | None, TaskOutcomes | None]:

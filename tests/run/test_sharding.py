@@ -8,7 +8,7 @@ import jax
 import numpy as np
 import pytest
 
-from rtcd_jax.run.sharding import sharded
+from rtcd_jax.run.sharding import ShardedEvaluate
 from rtcd_jax.system.cluster import Cluster, Preempted
 from rtcd_jax.system.errors import UserError
 from tests.paths import ROOT
@@ -25,7 +25,7 @@ def genomes_of(count):
 @pytest.mark.parametrize("count", [1, 3, 4, 9])
 def test_what_a_search_looks_at_is_that_of_the_evaluation(count):
     genomes = genomes_of(count)
-    found, whole = sharded(bowl, Cluster.of(), 4)(genomes, KEY), jax.device_get(bowl(genomes, KEY))
+    found, whole = ShardedEvaluate(bowl, Cluster.of(), 4)(genomes, KEY), jax.device_get(bowl(genomes, KEY))
     np.testing.assert_array_equal(found.genome, genomes)
     np.testing.assert_array_equal(found.status, whole.status)
     assert found.volumes.named.keys() == whole.volumes.named.keys()
@@ -36,13 +36,13 @@ def test_what_a_search_looks_at_is_that_of_the_evaluation(count):
 @pytest.mark.parametrize("rows", [[0], [8, 0, 3, 4], [5, 5], list(range(9))])
 def test_records_are_taken_from_wherever_they_are(rows):
     genomes = genomes_of(9)
-    found = sharded(bowl, Cluster.of(), 4)(genomes, KEY)
+    found = ShardedEvaluate(bowl, Cluster.of(), 4)(genomes, KEY)
     assert same(found.take(np.array(rows)), jax.device_get(bowl(genomes, KEY)).take(np.array(rows)))
 
 
 def test_between_chunks_a_request_to_stop_is_heard():
     cluster = Cluster.of()
-    evaluate = sharded(bowl, cluster, 4)
+    evaluate = ShardedEvaluate(bowl, cluster, 4)
     evaluate(genomes_of(9), KEY)
     cluster.ask_to_stop()
     with pytest.raises(Preempted):
@@ -59,7 +59,7 @@ import jax
 jax.config.update("jax_enable_x64", True)
 import numpy as np
 from rtcd_jax.system.cluster import Cluster
-from rtcd_jax.run.sharding import sharded
+from rtcd_jax.run.sharding import ShardedEvaluate
 from tests.search.fake_evaluation import bowl
 from tests.paths import ROOT
 from tests.pipeline import same
@@ -69,7 +69,7 @@ for count in (1, 5, 16, 23):
     genomes, rows = genomes_of(count), np.arange(count)
     whole = jax.device_get(bowl(genomes, KEY))
     for devices in (1, 2, 4):
-        many = sharded(bowl, Cluster.of(devices), 4)(genomes, KEY)
+        many = ShardedEvaluate(bowl, Cluster.of(devices), 4)(genomes, KEY)
         assert same(many.take(rows), whole), (count, devices)
 print("equal")
 """
@@ -80,13 +80,13 @@ jax.config.update("jax_enable_x64", True)
 import numpy as np
 from rtcd_jax.system.cluster import Cluster
 from rtcd_jax.evaluation import make_evaluate
-from rtcd_jax.run.sharding import sharded
+from rtcd_jax.run.sharding import ShardedEvaluate
 from tests import pipeline
 from tests.test_evaluation import assert_close
 evaluate, rows = make_evaluate(pipeline.problem()), np.arange(5)
 
 def on(devices, genomes):
-    return sharded(evaluate, Cluster.of(devices), 1)(genomes, pipeline.GENERATION)
+    return ShardedEvaluate(evaluate, Cluster.of(devices), 1)(genomes, pipeline.GENERATION)
 
 genomes = np.asarray(pipeline.genomes())
 one, two, four = (on(devices, genomes).take(rows) for devices in (1, 2, 4))

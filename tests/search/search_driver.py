@@ -15,7 +15,7 @@ import yaml
 from rtcd_jax.cli.exits import Exit
 from rtcd_jax.config import load as configuration
 from rtcd_jax.run import folder as storage
-from rtcd_jax.run.sharding import sharded
+from rtcd_jax.run.sharding import ShardedEvaluate
 from rtcd_jax.search import search
 from rtcd_jax.system.cluster import Cluster, Preempted, shutdown
 from tests.search.fake_evaluation import bowl
@@ -52,7 +52,7 @@ def drive(path, config, seconds=0.0, cluster=None):
     plan = plan_of(config)
     print("opening", flush=True)
     cluster = cluster or Cluster.of()
-    evaluate = sharded(bowl, cluster, CHUNK)
+    evaluate = ShardedEvaluate(bowl, cluster, CHUNK)
     with storage.RunFolder.open(path, config, cluster) as folder:
         begun = state = folder.restore(begin(plan))
         print("from", int(begun.generation), flush=True)

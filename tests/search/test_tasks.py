@@ -8,7 +8,7 @@ import pytest
 from rtcd_jax.config.schema import SearchConfig
 from rtcd_jax.evaluation import over_tasks
 from rtcd_jax.run.folder import RunFolder
-from rtcd_jax.run.sharding import sharded
+from rtcd_jax.run.sharding import ShardedEvaluate
 from rtcd_jax.search import archive, search
 from rtcd_jax.system.cluster import Cluster
 from rtcd_jax.types import Status
@@ -71,7 +71,7 @@ def generations(path, config, until=None):
     """Runs a search in a folder and stops before generation `until`; its state and the lines of all generations."""
     plan = search.Plan(config.search, config.elites, (0.3, 0.5, 0.7), (True, False, False), NAMES)
     example = jax.eval_shape(two_bowls, jnp.zeros((plan.settings.population, 3)), jax.random.key(0))
-    evaluate = sharded(two_bowls, Cluster.of(), search_driver.CHUNK)
+    evaluate = ShardedEvaluate(two_bowls, Cluster.of(), search_driver.CHUNK)
     with RunFolder.open(path, config) as folder:
         begun = state = folder.restore(search.start(plan, example))
         for state, record in search.run(plan, evaluate, begun):  # noqa: B007 (the last one is saved)

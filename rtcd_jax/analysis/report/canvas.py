@@ -138,5 +138,5 @@ def written(figure: "Figure", folder: Path, name: str) -> list[Path]:
         figure.savefig(content, format=suffix, metadata=undated)
         paths.append(folder / f"{name}.{suffix}")
         replace(paths[-1], content.getvalue())
-        figure.set_layout_engine("none")  # the print has the picture's places, which take a fifth of the time to find
+        figure.set_layout_engine(None)  # the print has the picture's places, which take a fifth of the time to find
     return paths

@@ -27,7 +27,6 @@ def main(config: str, population: str, devices: str, repeats: str) -> None:
 def measure(path: Path, population: int, devices: int, repeats: int) -> dict[str, Any]:
     """Times of `repeats` generations after the first one, which compiles."""
     import jax
-    import jax.numpy as jnp
 
     from rtcd_jax.analysis.scale.clock import peak_memory, timed
     from rtcd_jax.config.load import load
@@ -35,7 +34,7 @@ def measure(path: Path, population: int, devices: int, repeats: int) -> dict[str
     from rtcd_jax.genome import initial_genome
     from rtcd_jax.problem import make_problem
     from rtcd_jax.run.folder import RunFolder
-    from rtcd_jax.run.sharding import sharded
+    from rtcd_jax.run.sharding import ShardedEvaluate
     from rtcd_jax.search import search
     from rtcd_jax.system.cluster import Cluster
 
@@ -44,7 +43,7 @@ def measure(path: Path, population: int, devices: int, repeats: int) -> dict[str
     config = config.model_copy(update={"search": settings})
     problem, cluster = make_problem(config), Cluster.of(devices)
     chunk = device_chunk(problem, -(-population // devices), cluster.memory)
-    evaluate_sharded, evaluations = sharded(make_evaluate(problem), cluster, chunk), []
+    evaluate_sharded, evaluations = ShardedEvaluate(make_evaluate(problem), cluster, chunk), []
 
     def evaluate(genomes, key):
         evaluation, took = timed(lambda: evaluate_sharded(genomes, key))
@@ -52,8 +51,7 @@ def measure(path: Path, population: int, devices: int, repeats: int) -> dict[str
         return evaluation
 
     plan = search.Plan(settings, config.elites, tuple(initial_genome(problem).tolist()), problem.design_dims)
-    genomes = jnp.zeros((population, len(problem.free)))
-    state = search.start(plan, jax.eval_shape(make_evaluate(problem), genomes, jax.random.key(0)))
+    state = search.start(plan, evaluate_sharded.example(len(problem.free)))
     steps, writes = [], []
     with tempfile.TemporaryDirectory() as folder, RunFolder.open(Path(folder) / "run", config, cluster) as run:
         for _ in range(repeats + 1):
