@@ -22,6 +22,11 @@ def test_relative_links_lead_to_files(page):
     assert [target for target in targets if not (page.parent / target).exists()] == []
 
 
+@pytest.mark.parametrize("page", sorted(ROOT.glob("docs/*.md")), ids=lambda page: page.name)
+def test_links_of_the_site_stay_in_it(page):
+    assert [target for target in LINK.findall(page.read_text()) if target.startswith("..")] == []
+
+
 def test_the_site_shows_every_page():
     def pages(entry):
         if isinstance(entry, str):
