@@ -5,6 +5,7 @@ them is written for one candidate and mapped over batches that stay in a CPU's c
 """
 
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 
 import jax
@@ -130,7 +131,8 @@ def make_evaluate(problem: Problem, budget: Budget = search_budget) -> Evaluate:
         whole = over_tasks(each_task, problem.config.search.over_tasks)
         if problem.reset is None:
             return whole
-        return jax.vmap(lambda one: closed(problem, one, key, RESET_SAMPLES, RESET_SHARE))(whole)
+        found = jax.vmap(lambda one: closed(problem, one, key, RESET_SAMPLES, RESET_SHARE))(whole)
+        return replace(found, worst_at_resets=None)
 
     tasks = len(problem.tasks)
     if problem.reset is not None and not tasks:

@@ -12,6 +12,7 @@ from functools import partial
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from rtcd_jax.numerics import riccati, sampling
@@ -56,15 +57,18 @@ def closed(
     """One genome's evaluations with what their resets do; FUNNEL_EMPTY where one of them leads out of the next task's
     first ellipsoid, or out of this `share` of its level.
     """
-    after = largest_after_reset(problem, evaluations.tasks, key, samples)
+    after, worst = worst_after_reset(problem, evaluations.tasks, key, samples)
     leaves = jnp.where(jnp.all(after <= share), Status.OK, Status.FUNNEL_EMPTY)
     status = first_failure(evaluations.status, leaves)
-    return dataclasses.replace(evaluations, status=status, after_reset=after)
+    return dataclasses.replace(evaluations, status=status, after_reset=after, worst_at_resets=worst)
 
 
-def largest_after_reset(problem: Problem, tasks: Evaluation, key: PRNGKeyArray, samples: int) -> Float[Array, " tasks"]:
+def worst_after_reset(
+    problem: Problem, tasks: Evaluation, key: PRNGKeyArray, samples: int
+) -> tuple[Float[Array, " tasks"], Float[Array, "tasks 2 n"]]:
     """Of one genome's evaluations [T]: the largest V / rho_0 in the next task's first ellipsoid, at most 1 if the cycle
-    is closed there, of `samples` states that are uniform in each last one, and as many on its rim, after the reset.
+    is closed there, of `samples` states that are uniform in each last one, and as many on its rim, after the reset; and
+    the states before and after the reset that have it.
     """
     policies = tasks.funnel.policy
     count, _, n = policies.trajectory.xs.shape
@@ -76,9 +80,11 @@ def largest_after_reset(problem: Problem, tasks: Evaluation, key: PRNGKeyArray, 
     y = jnp.concatenate([y, y / jnp.sqrt(jnp.sum(y**2, 0))], -1)
     radii = jnp.sqrt(tasks.funnel.levels[:, -1])[:, None]
     ends = sets(-1).points(jnp.broadcast_to(radii, y.shape[1:]), y)
-    starts = jnp.roll(jax.vmap(partial(_reset, problem), (0, 1), 1)(tasks.candidate, ends), 1, 1)
-    levels = sets(0).level(starts) / tasks.funnel.levels[:, 0][:, None]
-    return jnp.roll(jnp.max(jnp.where(jnp.isnan(levels), jnp.inf, levels), -1), -1)
+    after = jax.vmap(partial(_reset, problem), (0, 1), 1)(tasks.candidate, ends)
+    levels = sets(0).level(jnp.roll(after, 1, 1)) / tasks.funnel.levels[:, 0][:, None]
+    levels = jnp.roll(jnp.where(jnp.isnan(levels), jnp.inf, levels), -1, 0)
+    states = jnp.moveaxis(jnp.stack([ends, after]), (2, 3), (0, 1))  # [tasks samples 2 n]
+    return jnp.max(levels, -1), states[np.arange(count), jnp.argmax(levels, -1)]
 
 
 def _reset(problem: Problem, candidate: Candidate, x: Float[Array, "n *batch"]) -> Float[Array, "n *batch"]:

@@ -191,7 +191,8 @@ class TaskEvaluations(eqx.Module):
     """What is known of one genome on every one of several `tasks`, and what the search makes of it.
 
     `volumes` are those over the tasks, knot by knot too; `status` is that of the first task that failed. Of a cycle
-    `after_reset` is the largest V / rho_0 in the next task's first ellipsoid, at most 1 if it is closed (reset.py).
+    `after_reset` is the largest V / rho_0 in the next task's first ellipsoid, at most 1 if it is closed (reset.py);
+    where elites are sampled again, `worst_at_resets` are the states before and after the reset that have it.
     """
 
     genome: Float[Array, "*batch d"]
@@ -199,6 +200,7 @@ class TaskEvaluations(eqx.Module):
     volumes: Volumes
     status: Int[Array, "*batch"]
     after_reset: Float[Array, "*batch T"] | None = None
+    worst_at_resets: Float[Array, "*batch T 2 n"] | None = None
 
     @property
     def borne(self) -> Float[Array, "*batch"] | None:

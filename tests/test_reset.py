@@ -13,6 +13,7 @@ import scipy.linalg
 from rtcd_jax.config.load import load, parse, resolved
 from rtcd_jax.elite.closed_loop import ClosedLoop, outside_limits, runge_kutta
 from rtcd_jax.elite.elite import Elite
+from rtcd_jax.elite.records import resets_in_words
 from rtcd_jax.elite.simulators import mujoco_of
 from rtcd_jax.evaluation import make_evaluate, over_tasks
 from rtcd_jax.genome import initial_genome
@@ -20,10 +21,13 @@ from rtcd_jax.plants import brachiation
 from rtcd_jax.problem import initial_design, make_problem
 from rtcd_jax.reset import closed, values_at_resets
 from rtcd_jax.run.format import arrays_of, common_record, record_of
+from rtcd_jax.run.optimize import optimize
 from rtcd_jax.run.reevaluation import row
+from rtcd_jax.system.cluster import Cluster
 from rtcd_jax.system.errors import ConfigError, UserError
 from rtcd_jax.types import Evaluation, Funnel, Status, Volumes
 from tests import linear_system as linear
+from tests.consoles import Output
 from tests.paths import CONFIGS
 
 JUMP = np.array([[0.9, 0.3], [-0.2, 1.6]])
@@ -95,6 +99,27 @@ def test_with_periodic_values_a_linear_reset_keeps_v(levels, status):
     expected = [levels[0][1] / levels[1][0], levels[1][1] / levels[0][0]]
     np.testing.assert_allclose(np.asarray(found.after_reset), expected, rtol=1e-9)
     assert found.status == status
+    start, last = _expected()
+    for (before, after), level, (_, rim), (first, _) in zip(
+        np.asarray(found.worst_at_resets), expected, levels, levels[::-1], strict=True
+    ):
+        np.testing.assert_allclose(after, JUMP @ before, rtol=1e-12)
+        np.testing.assert_allclose([before @ last @ before, after @ start @ after], [rim, level * first], rtol=1e-9)
+
+
+def test_the_worst_state_of_a_reset_is_named():
+    worst = {"before": [0.5, -1.25], "after": [1.0, 2e-5]}
+    each = {"into": "left", "largest_level": 1.25, "samples": 50, "epsilon": None, "worst": worst}
+    closes = each | {"largest_level": 0.5}
+    line, other, infinite = resets_in_words(
+        {"reset": {"right": each, "up": closes, "down": each | {"largest_level": None}}}
+    )
+    assert "right into left: the largest V/rho in the first ellipsoid there is 1.25, of 50 samples" in line
+    assert line.endswith("; it leaves the cycle from (0.5, -1.25) to (1, 2e-05)")
+    assert other.endswith("; it goes from (0.5, -1.25) to (1, 2e-05)")
+    assert "is inf" in infinite
+    del closes["worst"]  # as former runs have it
+    assert next(resets_in_words({"reset": {"up": closes}})).endswith("on its rim")
 
 
 # ---- AcroMonk
@@ -162,12 +187,26 @@ def test_a_cycle_of_one_task_is_not_searched():
 
 
 @pytest.mark.slow
+def test_a_search_in_which_no_cycle_closes_names_the_state_that_leaves(tmp_path):
+    config = parse(_changed(search={"population": 4, "generations": 1}, policy={"catch_weight": 1.0}))
+    with pytest.raises(UserError, match="FUNNEL_EMPTY") as error:
+        optimize(config, tmp_path / "run", Output().console, Cluster.of())
+    *_, head, first, second = str(error.value).splitlines()
+    assert head == "nearest to a closed cycle:"
+    assert first.startswith("reset of heavy_holds into light_holds: the largest V/rho")
+    assert second.startswith("reset of light_holds into heavy_holds: the largest V/rho")
+    assert "it leaves the cycle from (" in first + second
+
+
+@pytest.mark.slow
 def test_the_robot_that_was_built_closes_its_cycle_and_stays_in_the_funnels_for_eight_swings():
     """From uniform states of the first ellipsoid, in C MuJoCo, with the reset between the swings."""
     whole = evaluated()
     assert whole.status == Status.OK
     assert np.all(whole.after_reset <= 1)
+    whole = closed(problem(), whole, jax.random.key(1), 1000)
     record = common_record(problem(), whole)["reset"]
+    assert all(np.shape(each["worst"]["before"]) == (4,) for each in record.values())
     assert [each["into"] for each in record.values()] == ["light_holds", "heavy_holds"]
     elites = []
     for task, alone in enumerate(problem().tasks):

@@ -15,7 +15,8 @@ Numbers that are not finite are stored as null.
 import hashlib
 import io
 import json
-from collections.abc import Iterator, Mapping
+import math
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -138,12 +139,21 @@ def require_held_goal(path: Path, verb: str) -> None:
 
 
 def resets_in_words(record: Record) -> Iterator[str]:
-    """Of what a cycle of tasks has in common: where each reset leads."""
+    """Of what a cycle of tasks has in common: where each reset leads, and its worst state."""
     for name, reset in record.get("reset", {}).items():
-        yield (
-            f"reset of {name} into {reset['into']}: the largest V/rho in the first ellipsoid there is "
-            f"{reset['largest_level']:.3g}, of {reset['samples']} samples of the last one here, and as many on its rim"
+        level = math.inf if reset["largest_level"] is None else reset["largest_level"]
+        words = (
+            f"reset of {name} into {reset['into']}: the largest V/rho in the first ellipsoid there is {level:.3g}, of "
+            f"{reset['samples']} samples of the last one here, and as many on its rim"
         )
+        if "worst" in reset:
+            before, after = (_listed(reset["worst"][side]) for side in ("before", "after"))
+            words += f"; {'it leaves the cycle' if level > 1 else 'it goes'} from {before} to {after}"
+        yield words
+
+
+def _listed(state: Sequence[float | None]) -> str:
+    return f"({', '.join('?' if value is None else f'{value:.4g}' for value in state)})"
 
 
 def task_of(path: Path) -> str:

@@ -158,15 +158,16 @@ def common_record(problem: Problem, evaluation: TaskEvaluations) -> dict[str, An
         "over_tasks": config.search.over_tasks,
         "volumes": dict(host.volumes.named),
         "tasks": each,
-        **({} if host.after_reset is None else {"reset": _reset(problem, np.asarray(host.after_reset))}),
+        **({} if host.after_reset is None else {"reset": _reset(problem, host)}),
         "seed": config.search.seed,
         "config_hash": config_hash(config),
     }
 
 
-def _reset(problem: Problem, after: np.ndarray) -> dict[str, Any]:
-    """By task: into which one the reset at its end leads, and the largest V / rho_0 there of so many samples; where all
-    are inside, the failure probability of a uniform state of the last ellipsoid is at most epsilon.
+def _reset(problem: Problem, host: TaskEvaluations) -> dict[str, Any]:
+    """By task: into which one the reset at its end leads, the largest V / rho_0 there of so many samples, and the state
+    before and after the reset that has it; where all are inside, the failure probability of a uniform state of the last
+    ellipsoid is at most epsilon.
     """
     names, config = list(problem.config.tasks), problem.config
     samples, statements = elite_budget(problem).samples_per_knot, len(names) * (config.elites.count + 1)
@@ -177,9 +178,17 @@ def _reset(problem: Problem, after: np.ndarray) -> dict[str, Any]:
             "largest_level": float(level),
             "samples": samples,
             "epsilon": promise if level <= 1 else None,
+            **_worst(host, i),
         }
-        for i, (name, level) in enumerate(zip(names, after, strict=True))
+        for i, (name, level) in enumerate(zip(names, np.asarray(host.after_reset), strict=True))
     }
+
+
+def _worst(host: TaskEvaluations, task: int) -> dict[str, Any]:
+    if host.worst_at_resets is None:
+        return {}
+    before, after = host.worst_at_resets[task]
+    return {"worst": {"before": before, "after": after}}
 
 
 def _keep_out(config: Config) -> list[dict[str, Any]]:

@@ -7,15 +7,17 @@ from pathlib import Path
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from rtcd_jax.config.load import Config
 from rtcd_jax.config.schema import REFINABLE, REFINEMENT_STEPS
 from rtcd_jax.elite.records import TASKS, Record, elite_names, read_generations, resets_in_words
-from rtcd_jax.evaluation import device_chunk, make_evaluate
+from rtcd_jax.evaluation import device_chunk, elite_budget, elite_key, make_evaluate
 from rtcd_jax.genome import initial_genome
 from rtcd_jax.problem import Problem, make_problem
 from rtcd_jax.refinement import Refinement
+from rtcd_jax.reset import closed
 from rtcd_jax.run import live
 from rtcd_jax.run.folder import RunFolder
 from rtcd_jax.run.format import arrays_of, common_arrays, common_record, record_of
@@ -68,6 +70,7 @@ def optimize(config: Config, folder: Path, console: Console, cluster: Cluster, l
         )
         again = Reevaluation(problem, cluster, example, console)
         state, pace = begun, _Pace(config)
+        generation = None
         with live.log(log if cluster.first else None, folder) as show:
             try:
                 steps = search.run(plan, evaluate, begun, best)
@@ -81,6 +84,8 @@ def optimize(config: Config, folder: Path, console: Console, cluster: Cluster, l
             except Preempted:
                 run.save(state, int(state.generation))
                 raise
+            except search.NothingFeasible as error:
+                raise UserError("\n".join([str(error), *_open_cycle(problem, evaluate, generation)])) from error
         run.save(state, int(state.generation))
         if int(state.generation) < config.search.generations:
             console.message(f"no gain of {search.GAIN:.1%} in {config.search.patience} generations: the search is over")
@@ -88,10 +93,12 @@ def optimize(config: Config, folder: Path, console: Console, cluster: Cluster, l
         *sampled, initial = again.sample([*_filled(state.elites), initial])
         best_first = _filled(search.finish(plan, state, _stacked(sampled, state.elites)))
         if not best_first:
-            raise UserError(
+            resets = resets_in_words(common_record(problem, sampled[0])) if problem.tasks else ()
+            text = (
                 "none of the elites kept a funnel under more samples: raise funnel.directions or funnel.trials, "
                 "so that the search is not misled by luck"
             )
+            raise UserError("\n".join([text, *resets]))
         refinements: Sequence[Record | None] = [None] * len(best_first)
         partial_state = PartialState(folder / PARTIAL, config.checkpoint.seconds, cluster)
         if config.search.refine:
@@ -165,6 +172,22 @@ def _stacked(evaluations: list[Any], elites: Elites) -> Any:
 def _initial(problem: Problem, evaluate: Callable[..., Sharded]) -> Any:
     genome = np.asarray(initial_genome(problem))
     return row(evaluate(genome[None], jax.random.key(0)).take(np.array([0])), 0)
+
+
+def _open_cycle(problem: Problem, evaluate: ShardedEvaluate, last: search.Generation | None) -> Iterator[str]:
+    """Of a cycle that no candidate closed: where the resets of the one that is nearest to it lead, among those of the
+    last generation that have a funnel on every task; nothing where there is none.
+    """
+    if problem.reset is None or last is None:
+        return
+    funnels = np.all([task["statuses"] == Status.OK for task in last.tasks.values()], 0)
+    if not funnels.any():
+        return
+    again: Any = evaluate(last.genomes[funnels], elite_key()).take(np.arange(funnels.sum()))
+    nearest = row(again, int(np.argmin(np.max(again.after_reset, -1))))
+    states = closed(problem, jax.tree.map(jnp.asarray, nearest), elite_key(), elite_budget(problem).samples_per_knot)
+    yield "nearest to a closed cycle:"
+    yield from resets_in_words(common_record(problem, jax.device_get(states)))
 
 
 def _store(problem: Problem, elites: Sequence[Reported], initial: Reported, run: RunFolder, console: Console) -> None:
