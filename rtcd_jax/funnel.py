@@ -30,6 +30,7 @@ from rtcd_jax.policy import catch_weight
 from rtcd_jax.problem import Problem
 from rtcd_jax.types import Candidate, Funnel, Policy, Status, first_failure
 from rtcd_jax.validation import Rollouts, SamplingBudget, validate_intervals, validate_paths
+from rtcd_jax.window import window_radius
 
 SMALLEST = 1e-3
 """Radius below which a set counts as empty, over the box's, that at which the last gain saturates, or a catch set's."""
@@ -75,6 +76,8 @@ def estimate_funnel(
     if not problem.caught:
         last = goal_level(rollouts, boxes[-1], saturated, keys[0], budget)
     else:
+        if problem.window is not None:
+            boxes = boxes.at[-1].min(window_radius(problem, candidate, goal_set))
         caught = catch_weight(problem, candidate)
         last, scales = jnp.minimum(caught, boxes[-1] ** 2), jnp.minimum(scales, jnp.sqrt(caught))
     offsets = rollouts.offsets()

@@ -25,6 +25,7 @@ from rtcd_jax.numerics.hermite import cubic_hermite
 from rtcd_jax.numerics.loops import packed_scan
 from rtcd_jax.problem import Problem
 from rtcd_jax.types import Candidate, Policy, Status, Trajectory, first_failure
+from rtcd_jax.window import catch_shape
 
 DOUBLINGS = 8
 """At most 2^8 short intervals a substep resolve a closed loop of 1000 poles a second at h = 0.1 s."""
@@ -136,8 +137,8 @@ def value_rates(problem: Problem, candidate: Candidate, policy: Policy) -> Float
 
 def final_value(problem: Problem, candidate: Candidate) -> tuple[Float[Array, "n n"], Bool[Array, ""]]:
     """S of the goal's infinite-horizon LQR, and whether it exists; that of the catch set where there is one."""
-    if problem.catch is not None:
-        return catch_weight(problem, candidate) * jnp.asarray(problem.catch, candidate.q.dtype), jnp.asarray(True)
+    if problem.caught and problem.reset is None:
+        return catch_weight(problem, candidate) * catch_shape(problem, candidate), jnp.asarray(True)
     goal = jnp.asarray(problem.goal, candidate.q.dtype)
     rest = jnp.zeros(problem.plant.m, goal.dtype)
     a, b = _discounted(problem, candidate, *linearize(problem, candidate, goal, rest))

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -12,6 +13,7 @@ from jaxtyping import Array, Float
 
 from rtcd_jax.config.load import Config
 from rtcd_jax.config.robot import value_of
+from rtcd_jax.config.schema import CatchConfig
 from rtcd_jax.numerics.keep_out import Set, sets_of
 from rtcd_jax.plants import brachiation, make_plant
 from rtcd_jax.plants.base import Plant
@@ -26,6 +28,8 @@ NEAR = 0.15
 """From a quarter turn [rad]: what was meant by 3, 3.1 or 3.14."""
 UNREACHED = 1e-9
 """Least share of the pencil's largest singular value with which an input reaches a mode."""
+STRETCHED = 1e6
+"""Condition of a point's Jacobian from which on it says nothing of one direction."""
 DESIGNS, STATES, LARGEST_STATE = 3, 8, 10.0
 """Where the MJCF is compared with the equations: random designs, states of each, within this or the task's limits."""
 
@@ -39,6 +43,27 @@ class Reset(NamedTuple):
     fields: tuple[str, ...]
     numbers: Callable[..., dict[str, Any]]
     state: Callable[..., Array]
+
+
+class Point(NamedTuple):
+    """A point of a robot with two joints: the numbers that it needs, and its place [2 *batch] in meters."""
+
+    fields: tuple[str, ...]
+    place: Callable[..., Array]
+
+
+POINTS = {"gripper": Point(("arm_length",), brachiation.hook)}
+"""By the name in `task.catch.window`."""
+
+
+class Window(NamedTuple):
+    """What a point may be off its place at the goal: by at most `size` [m], and where the window is the catch set's
+    shape, with `speed` as half width of the velocities.
+    """
+
+    place: Callable[..., Array]
+    size: float
+    speed: float | None
 
 
 RESETS = {"brachiation": Reset(brachiation.FIELDS, brachiation.exchanged, brachiation.catch)}
@@ -85,6 +110,8 @@ class Problem:
     """
     reset: Callable | None = None
     """R(numbers of the robot, x) of tasks in a cycle: each motion ends where R leads into the next one's funnel."""
+    window: Window | None = None
+    """Of the last ellipsoid, with `reset` or as the catch set's shape."""
     cost_center: Float[np.ndarray, " n"] | None = None
     """From where the trajectory's cost counts; None for the goal."""
     tasks: tuple["Problem", ...] = ()
@@ -93,7 +120,11 @@ class Problem:
     @property
     def caught(self) -> bool:
         """Whether the motions end with t_N, and no goal is held."""
-        return self.catch is not None or self.reset is not None
+        return self.catch is not None or self.reset is not None or self.window is not None
+
+    def numbers(self, candidate: Candidate) -> dict[str, Any]:
+        """The candidate's robot's own, constants and design, by name."""
+        return vars(self.of(candidate).plant) | vars(candidate.design)
 
     @property
     def intervals(self) -> int:
@@ -176,8 +207,11 @@ def _make_problem(config: Config, path: tuple[str, ...]) -> Problem:
         uncertainty=_uncertainty(config),
         catch=np.diag(1 / np.square(task.catch.half_widths)) if task.catch.half_widths else None,
         reset=RESETS[task.catch.reset].state if task.catch.cyclic else None,
+        window=_window(task.catch),
         cost_center=np.array(task.cost_center, float) if task.cost_center else None,
     )
+    if problem.window is not None:
+        _require_point(problem)
     if not problem.caught:
         _require_equilibrium(problem, path)
         _require_stabilizable(problem, path)
@@ -228,6 +262,28 @@ def _variables(config: Config):
 def _keep_out(config: Config) -> tuple[Set, ...]:
     ends = [end for alone in config.each.values() for end in (alone.start, alone.task.goal)]
     return sets_of(config.task.model_dump().get("keep_out", ()), np.array(ends))
+
+
+def _window(catch: CatchConfig) -> Window | None:
+    for name, size in catch.window.items():
+        return Window(POINTS[name].place, size, catch.speed)
+    return None
+
+
+def _require_point(problem: Problem) -> None:
+    """Raises ConfigError if the robot has no such point or, where the window is the catch set's shape, if a joint does
+    not move it at the goal.
+    """
+    ((name, size),) = problem.config.task.catch.window.items()
+    path, fields = ("task", "catch", "window", name), POINTS[name].fields
+    robot = vars(problem.plant) | vars(initial_design(problem))
+    if problem.plant.n != 4 or any(field not in robot for field in fields):
+        text = f"needs a robot with two joints and {', '.join(fields)}"
+        raise ConfigError([Fault(path, text, size)])
+    turn = np.asarray(jax.jacfwd(partial(POINTS[name].place, robot))(jnp.asarray(problem.goal)))[:, :2]
+    if problem.window is not None and problem.window.speed is not None and np.linalg.cond(turn) > STRETCHED:
+        text = "is no shape at the goal: there the arms are stretched or folded, and not every direction is open to it"
+        raise ConfigError([Fault(path, text, size)])
 
 
 def _uncertainty(config: Config) -> Uncertainty | None:

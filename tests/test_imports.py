@@ -19,6 +19,7 @@ LAYERS = (
         "problem",
         "genome",
         "trajectory",
+        "window",
         "policy",
         "adversary",
         "centers",
@@ -39,8 +40,8 @@ LAYERS = (
 
 # The steps of the algorithm: each imports from those before it.
 STEPS = (
-    "types", "problem", "genome", "trajectory", "policy", "adversary", "rollout", "validation", "funnel", "volume",
-    "reset", "evaluation", "refinement",
+    "types", "problem", "genome", "trajectory", "window", "policy", "adversary", "rollout", "validation", "funnel",
+    "volume", "reset", "evaluation", "refinement",
 )  # fmt: skip
 
 # Packages that only some modules may import.

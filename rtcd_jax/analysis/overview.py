@@ -17,6 +17,7 @@ from rtcd_jax.elite.records import (
     read_generations,
     resets_in_words,
     task_folders,
+    windows_in_words,
 )
 from rtcd_jax.system.console import Console, table
 from rtcd_jax.system.errors import UserError
@@ -132,6 +133,7 @@ def show_run(path: Path, console: Console) -> Iterator[str]:
     yield f"best: {candidate(run)}"
     if run.absence:
         yield run.absence
+    yield from windows_in_words(run.best.record)
     volumes = gains([run])
     yield table(
         volumes.heads,

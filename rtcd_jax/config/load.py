@@ -219,7 +219,7 @@ def _catch(
 ) -> Iterator[Problem]:
     if not task.caught:
         if policy.weighs_catch:
-            yield Problem(("policy", "catch_weight"), "needs task.catch.half_widths: without a catch set it has no use")
+            yield Problem(("policy", "catch_weight"), "needs task.catch: without a catch set it has no use")
         return
     if task.catch.cyclic and not tasks:
         yield Problem(("task", "catch", "reset"), "leads from task to task: it needs `tasks`, two at least")

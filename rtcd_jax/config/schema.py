@@ -154,6 +154,14 @@ class CatchConfig(Settings):
         description="instead of half widths: the tasks are a cycle, each ends where this reset leads into the next "
         "one's funnel; brachiation: the free hook takes the next bar, the other one lets go",
     )
+    window: dict[Literal["gripper"], Annotated[float, Field(ge=1e-6, le=1e6)]] = Field(
+        default={},
+        description="how far the gripper, the free hook of a robot that brachiates, may be from its place at the goal: "
+        "with `reset` in the last ellipsoids, else, with `speed`, the catch set itself, instead of half widths [m]",
+    )
+    speed: Annotated[float, Field(ge=1e-6, le=1e6)] | None = Field(
+        default=None, description=f"half width of all velocities in the catch set of a `window` [{UNIT}]"
+    )
 
     @model_serializer(mode="wrap")
     def _of_its_kind(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
@@ -167,11 +175,20 @@ class CatchConfig(Settings):
     def problems(self) -> Iterator[Problem]:
         if self.half_widths and self.cyclic:
             yield Problem(("reset",), "must be left away where there are half_widths: the one or the other", self.reset)
+        if self.half_widths and self.window:
+            yield Problem(("window",), "must be left away where there are half_widths", self.window)
+        if self.window and not self.cyclic and self.speed is None:
+            yield Problem(("speed",), "must be a number: a window without reset is the catch set with it", self.speed)
+        if self.speed is not None and (self.cyclic or not self.window):
+            yield Problem(("speed",), "must be left away: it belongs to a window without reset", self.speed)
 
     def in_words(self, states: Mapping[str, str]) -> str:
         """The half widths of states that are given with their units, or what the reset does."""
+        points = [f"{name} within {size:.6g} m of its place" for name, size in self.window.items()]
         if self.cyclic:
-            return f"what the reset ({self.reset}) leads into the next task's first ellipsoid"
+            return "; ".join([f"what the reset ({self.reset}) leads into the next task's first ellipsoid", *points])
+        if self.window:
+            return ", ".join([*points, f"velocities ± {self.speed:.6g}"])
         widths = zip(states.items(), self.half_widths, strict=True)
         return ", ".join(f"{name} ± {width:.6g} {unit}" for (name, unit), width in widths)
 
@@ -202,7 +219,7 @@ class TaskConfig(Settings):
     @property
     def caught(self) -> bool:
         """Whether the motion ends in a catch set, and no time follows."""
-        return bool(self.catch.half_widths or self.catch.cyclic)
+        return bool(self.catch.half_widths or self.catch.cyclic or self.catch.window)
 
     def problems(self) -> Iterator[Problem]:
         for i, limit in enumerate(self.state_limits):

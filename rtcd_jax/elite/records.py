@@ -152,6 +152,15 @@ def resets_in_words(record: Record) -> Iterator[str]:
         yield words
 
 
+def windows_in_words(record: Record) -> Iterator[str]:
+    """How far the points with a window are from their places at the goal in the last ellipsoid."""
+    for name, window in record.get("window", {}).items():
+        yield (
+            f"{name}: at most {window['farthest']:.3g} m from its place at the goal in the last ellipsoid (window "
+            f"{window['size']:g} m)"
+        )
+
+
 def _listed(state: Sequence[float | None]) -> str:
     return f"({', '.join('?' if value is None else f'{value:.4g}' for value in state)})"
 

@@ -14,7 +14,7 @@ from typing import Any
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from rtcd_jax.numerics.trigonometry import cos
+from rtcd_jax.numerics.trigonometry import cos, sin
 
 FIELDS = (
     "arm_length", "support_mass", "support_center", "support_inertia", "swing_mass", "swing_center", "swing_inertia",
@@ -29,6 +29,12 @@ def exchanged(numbers: Numbers) -> dict[str, Any]:
     """Those of the `FIELDS` as the robot hangs from its other hook: the arms change places; the inverse of itself."""
     arm, m1, c1, i1, m2, c2, i2 = (numbers[name] for name in FIELDS)
     return dict(zip(FIELDS, (arm, m2, arm - c2, i2, m1, arm - c1, i1), strict=True))
+
+
+def hook(numbers: Numbers, x: Float[Array, "4 *batch"]) -> Float[Array, "2 *batch"]:
+    """Where the free hook is, from the bar that the robot hangs from, forward and up [m], elementwise."""
+    arm, first, second = numbers["arm_length"], x[0], x[0] + x[1]
+    return jnp.stack([arm * (sin(first) + sin(second)), -arm * (cos(first) + cos(second))])
 
 
 def catch(numbers: Numbers, x: Float[Array, "4 *batch"]) -> Float[Array, "4 *batch"]:

@@ -13,12 +13,14 @@ from rtcd_jax.config.load import Config, config_hash
 from rtcd_jax.config.plants import PLANTS
 from rtcd_jax.evaluation import elite_budget, volumes_of
 from rtcd_jax.genome import decode
+from rtcd_jax.numerics.ellipsoid import Ellipsoids
 from rtcd_jax.numerics.proportion import failure_bound
 from rtcd_jax.policy import input_jumps, options
 from rtcd_jax.problem import Problem
 from rtcd_jax.types import Evaluation, Funnel, Policy, Status, TaskEvaluations, Trajectory
 from rtcd_jax.validation import PhysicsComparison
 from rtcd_jax.volume import largest_pushes
+from rtcd_jax.window import farthest
 
 
 def arrays_of(problem: Problem, evaluation: Evaluation) -> dict[str, np.ndarray]:
@@ -106,6 +108,7 @@ def record_of(
         "state_limits": [limit if np.isfinite(limit) else None for limit in problem.state_limits.tolist()],
         **({"keep_out": keep_out} if (keep_out := _keep_out(config)) else {}),
         **({"catch": config.task.catch.model_dump()} if config.task.caught else {}),
+        **({"window": _window(problem, evaluation)} if config.task.catch.window else {}),
         "status": Status(int(host.status)).name,
         "rung": "sampled",
         "epsilon": epsilon(funnel.trials, config.funnel.confidence, budget.rounds * candidates),
@@ -182,6 +185,14 @@ def _reset(problem: Problem, host: TaskEvaluations) -> dict[str, Any]:
         }
         for i, (name, level) in enumerate(zip(names, np.asarray(host.after_reset), strict=True))
     }
+
+
+def _window(problem: Problem, evaluation: Evaluation) -> dict[str, Any]:
+    """By point: how far from its place at the goal it may be, and is at most in the last ellipsoid [m]."""
+    funnel, own = evaluation.funnel, problem.of(evaluation.candidate)
+    last = jax.tree.map(jnp.asarray, (funnel.policy.trajectory.xs[-1:].T, funnel.policy.values[-1][..., None]))
+    found = farthest(own, evaluation.candidate, Ellipsoids.about(*last), jnp.asarray(funnel.levels[-1]))
+    return {name: {"size": size, "farthest": float(found)} for name, size in own.config.task.catch.window.items()}
 
 
 def _worst(host: TaskEvaluations, task: int) -> dict[str, Any]:
