@@ -312,6 +312,6 @@ def test_what_is_wrong_is_told_in_one_line(changes, line):
 
 def test_a_catch_weight_belongs_to_a_catch_set():
     plain = yaml.safe_load(configuration.EXAMPLE)
-    with pytest.raises(ConfigError, match=r"policy\.catch_weight: needs task\.catch\.half_widths"):
+    with pytest.raises(ConfigError, match=r"policy\.catch_weight: needs task\.catch"):
         configuration.parse(plain | {"policy": {"catch_weight": 2}})
     assert configuration.parse(plain | {"task": CAUGHT["task"]}).policy.catch_weight == 1

@@ -102,7 +102,7 @@ WRONG = {
     "no size": (
         {"window": {"gripper": -0.03}, "speed": 1.0},
         "acromonk",
-        r"task\.catch\.window = -0\.03: must be >= 1e-06",
+        r"task\.catch\.window = -0\.03: must be >=",
     ),
     "no gripper": (
         {"speed": 1.0, **GRIPPER},
