@@ -150,7 +150,8 @@ def _within(target: Path, folder: Path, run: Path) -> Path:
 
 
 class AnimateOptions(Options):
-    """Show the swing-up by MuJoCo's renderer as MP4 and GIF: initial beside best, undisturbed and disturbed.
+    """Show the swing-up by MuJoCo's renderer as MP4 and GIF: initial beside best, undisturbed and disturbed. Of a cycle
+    of tasks the best, swing after swing.
 
     Needs no display: it draws by EGL or OSMesa.
 
@@ -160,11 +161,17 @@ class AnimateOptions(Options):
     run: Run = Field(description="the run folder")
     to: Annotated[Path | None, shown("DIR", "animation/ in RUN")] = Field(default=None, description="for the videos")
     seed: int = Field(default=0, description="of the disturbed start, from the first ellipsoid [-]", ge=0)
+    swings: int = Field(default=4, description="of a cycle of tasks: so many, one behind the other [-]", ge=1)
 
 
 def animate(options: AnimateOptions, console: Console) -> Exit:
     from rtcd_jax.analysis.animate.animate import animate_run
+    from rtcd_jax.analysis.animate.cycle import animate_cycle
+    from rtcd_jax.elite.records import is_cycle
 
+    if is_cycle(options.run):
+        animate_cycle(options.run, options.to, options.seed, options.swings, console)
+        return Exit.OK
     for folder in _each_task(options.run, console):
         to = options.to and _within(options.to, folder, options.run)
         animate_run(folder, to, options.seed, console)

@@ -138,6 +138,11 @@ def require_held_goal(path: Path, verb: str) -> None:
         )
 
 
+def is_cycle(path: Path) -> bool:
+    """Whether the folder is that of a run for several tasks, each of which ends where the next one begins."""
+    return task_folders(path) != [path] and read_config(path).task.catch.cyclic
+
+
 def resets_in_words(record: Record) -> Iterator[str]:
     """Of what a cycle of tasks has in common: where each reset leads, and its worst state."""
     for name, reset in record.get("reset", {}).items():

@@ -6,7 +6,7 @@ The disturbed start is drawn from the best funnel's first ellipsoid, near its bo
 import contextlib
 import shutil
 import subprocess
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -72,11 +72,17 @@ def animate_run(folder: Path, to: Path | None, seed: int, console: Console) -> l
     backend = choose_backend()
     columns = _columns(folder, config, seed, console)
     console.message(f"rendering {len(columns[0].motions.time)} frames by MuJoCo ({backend})")
-    program, size = ffmpeg(), (SIDE * len(columns) + GAP * (len(columns) - 1), 2 * SIDE + GAP)
+    size = SIDE * len(columns) + GAP * (len(columns) - 1), 2 * SIDE + GAP
+    return write_videos(_frames(columns, size, console), size, target, console)
+
+
+def write_videos(frames: Iterable["Image"], size: tuple[int, int], target: Path, console: Console) -> list[Path]:
+    """Writes frames of this size as `swingup.gif` and, with an ffmpeg, `swingup.mp4` into a folder."""
+    program = ffmpeg()
     written = [target / "swingup.gif", target / "swingup.mp4"][: 1 + bool(program)]
     with mp4(written[1], size, program) if program else contextlib.nullcontext() as add:
         small = []
-        for k, frame in enumerate(_frames(columns, size, console)):
+        for k, frame in enumerate(frames):
             if k % GIF_EVERY == 0:
                 small.append(frame.resize((size[0] // 2, size[1] // 2)))
             if add:
@@ -105,7 +111,7 @@ def _columns(folder: Path, config: Config, seed: int, console: Console) -> list[
     elites, absence = initial_and_best(folder)
     if absence:
         console.message(f"{absence}: the best elite is shown alone")
-    disturbed = _disturbed(elites["best"], seed)
+    disturbed = disturbed_start(elites["best"], seed)
     starts = np.stack([np.array(config.start), disturbed])
     time = frame_times(list(elites.values()), HOLD, RATE)
     console.message(
@@ -119,7 +125,7 @@ def _columns(folder: Path, config: Config, seed: int, console: Console) -> list[
     return columns
 
 
-def _disturbed(elite: Elite, seed: int) -> np.ndarray:
+def disturbed_start(elite: Elite, seed: int) -> np.ndarray:
     """A state in a random direction from the first knot, near the boundary of its ellipsoid."""
     _, drawn = elite.sample(1, np.random.default_rng(seed))
     return elite.x[0] + np.sqrt(NEAR * elite.rho[0] / elite.value(0, drawn)) * (drawn[0] - elite.x[0])
@@ -140,23 +146,24 @@ def _frames(columns: Sequence[Column], size: tuple[int, int], console: Console) 
             for i, (column, camera) in enumerate(zip(columns, cameras, strict=True)):
                 for row, positions in enumerate(column.positions[k]):
                     panel = Image.fromarray(camera.picture(positions))
-                    _write_on(panel, column, k, row)
+                    titles = column.label, ("undisturbed", "disturbed start")[row]
+                    write_on(panel, titles, float(column.motions.time[k]), float(column.motions.ratio[k, row]))
                     frame.paste(panel, (i * (SIDE + GAP), row * (SIDE + GAP)))
             yield frame
             if (k + 1) % RATE == 0 or k + 1 == frames:
                 console.progress(Progress(k + 1, frames, f"frame {k + 1} of {frames}  {clock.times(k + 1, frames)}"))
 
 
-def _write_on(panel: "Image", column: Column, k: int, row: int) -> None:
+def write_on(panel: "Image", titles: tuple[str, str], time: float, ratio: float) -> None:
+    """Titles, time [s], and whether the state is in its funnel, on a panel."""
     from PIL import ImageDraw
 
     draw, (large, small) = ImageDraw.Draw(panel), _fonts()
-    draw.text((14, 8), column.label, fill=_INK, font=large)
-    draw.text((14, 36), ("undisturbed", "disturbed start")[row], fill=_INK, font=small)
-    draw.text((SIDE - 14, 8), f"{column.motions.time[k]:.2f} s", fill=_INK, font=large, anchor="ra")
-    ratio = column.motions.ratio[k, row]
+    draw.text((14, 8), titles[0], fill=_INK, font=large)
+    draw.text((14, 36), titles[1], fill=_INK, font=small)
+    draw.text((panel.width - 14, 8), f"{time:.2f} s", fill=_INK, font=large, anchor="ra")
     text, color = (f"in its funnel, V/ρ = {ratio:.2f}", _GOOD) if ratio <= 1 else ("outside its funnel", _BAD)
-    draw.text((14, SIDE - 12), text, fill=color, font=small, anchor="ld")
+    draw.text((14, panel.height - 12), text, fill=color, font=small, anchor="ld")
 
 
 @cache

@@ -3,6 +3,7 @@
 import os
 import subprocess
 import sys
+from collections.abc import Sequence
 from typing import Any, Self, final
 
 import numpy as np
@@ -11,6 +12,8 @@ from jaxtyping import Float, UInt8
 from rtcd_jax.system.errors import UserError
 
 BACKENDS = ("egl", "osmesa")
+_BAR, _STEEL = (0.016, 0.08, 0.0), (0.35, 0.38, 0.43, 1.0)
+"""Radius and half the length [m] of a bar, and its color."""
 _PROBE = (
     "import mujoco; context = mujoco.GLContext(8, 8); context.make_current(); "
     "mujoco.MjrContext(mujoco.MjModel.from_xml_string('<mujoco/>'), 100)"
@@ -69,11 +72,32 @@ class Camera:
         camera = self._model.camera(self._camera)
         camera.fovy[:] = 2 * np.degrees(np.arctan(height / np.linalg.norm(camera.pos)))
 
-    def picture(self, positions: Float[np.ndarray, " q"]) -> UInt8[np.ndarray, "height width 3"]:
-        """The robot at these joint positions."""
+    def look(self, middle: float, height: float, distance: float) -> None:
+        """From in front at a point in the middle of the picture, `middle` [m] to the right of the origin, from such a
+        `distance` that `height` [m] is all that it shows.
+        """
+        camera = self._model.camera(self._camera)
+        camera.pos[0], camera.pos[1] = middle, -distance
+        camera.fovy[:] = 2 * np.degrees(np.arctan(height / 2 / distance))
+
+    def picture(
+        self, positions: Float[np.ndarray, " q"], bars: Sequence[float] = ()
+    ) -> UInt8[np.ndarray, "height width 3"]:
+        """The robot at these joint positions, and bars across the picture's plane, so far to the right [m]."""
         self._pose(positions)
         self._renderer.update_scene(self._data, self._camera)
+        for bar in bars:
+            self._add_bar(bar)
         return self._renderer.render()
+
+    def _add_bar(self, to_the_right: float) -> None:
+        scene, across = self._renderer.scene, np.array([1, 0, 0, 0, 0, 1, 0, -1, 0], float)
+        kind, place = self._mujoco.mjtGeom.mjGEOM_CYLINDER, np.array([to_the_right, 0, 0])
+        self._mujoco.mjv_initGeom(
+            scene.geoms[scene.ngeom], kind, np.array(_BAR), place, across, np.array(_STEEL, np.float32)
+        )
+        scene.geoms[scene.ngeom].specular = 0
+        scene.ngeom += 1
 
     def _pose(self, positions: np.ndarray) -> None:
         self._data.qpos[:] = positions

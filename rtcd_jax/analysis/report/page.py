@@ -34,7 +34,7 @@ from rtcd_jax.analysis.report.reading import (
 from rtcd_jax.analysis.report.robot import robots_of
 from rtcd_jax.analysis.report.traces import Plot, legend, plots_of
 from rtcd_jax.analysis.report.words import duration, guarantee, ratio, volume_unit, words
-from rtcd_jax.elite.records import task_folders
+from rtcd_jax.elite.records import task_folders, task_of
 from rtcd_jax.system.console import Console
 from rtcd_jax.system.errors import UserError
 from rtcd_jax.system.files import replace
@@ -200,8 +200,12 @@ def _sections(
         yield section("Compared", table(tables.comparison(runs)))
     yield section("Funnels", *funnels)
     for run in runs:
-        if video := _video(run):
+        if video := _video(run.path, run.name):
             yield section("Swing-up" if alone else f"Swing-up: {run.name}", video)
+    wholes = {run.path.parent.parent for run in runs if task_of(run.path)}
+    for whole in wholes if alone is None else ():
+        if video := _video(whole, whole.name):
+            yield section("Swing after swing", video)
     for name, chart in of_motion.items():
         yield section(chart.title, *_charted(name, chart))
     promise = "" if alone is None else note(f"The best funnel is {guarantee(alone.best.record)}.")
@@ -293,14 +297,14 @@ def _robot(number: int, view: FunnelView) -> str:
     )
 
 
-def _video(run: Run) -> str | None:
-    """What `rtcd animate` left in the run's folder: the video, else the moving picture."""
-    folder, label = run.path / "animation", f'aria-label="swing-up of {html.escape(run.name)}"'
+def _video(run: Path, name: str) -> str | None:
+    """What `rtcd animate` left in a run's folder: the video, else the moving picture."""
+    folder, label = run / "animation", f'aria-label="swing-up of {html.escape(name)}"'
     video, picture = folder / "swingup.mp4", folder / "swingup.gif"
     if video.is_file():
         return f'<video controls loop muted playsinline {label} src="data:video/mp4;base64,{_base64(video)}"></video>'
     if picture.is_file():
-        return f'<img src="data:image/gif;base64,{_base64(picture)}" alt="swing-up of {html.escape(run.name)}">'
+        return f'<img src="data:image/gif;base64,{_base64(picture)}" alt="swing-up of {html.escape(name)}">'
     return None
 
 
