@@ -58,12 +58,12 @@ POINTS = {"gripper": Point(("arm_length",), brachiation.hook)}
 
 class Window(NamedTuple):
     """What a point may be off its place at the goal: by at most `size` [m], and where the window is the catch set's
-    shape, with `speed` as half width of the velocities.
+    shape, with `speed` > 0 as half width of the velocities.
     """
 
     place: Callable[..., Array]
     size: float
-    speed: float | None
+    speed: float
 
 
 RESETS = {"brachiation": Reset(brachiation.FIELDS, brachiation.exchanged, brachiation.catch)}
@@ -281,7 +281,7 @@ def _require_point(problem: Problem) -> None:
         text = f"needs a robot with two joints and {', '.join(fields)}"
         raise ConfigError([Fault(path, text, size)])
     turn = np.asarray(jax.jacfwd(partial(POINTS[name].place, robot))(jnp.asarray(problem.goal)))[:, :2]
-    if problem.window is not None and problem.window.speed is not None and np.linalg.cond(turn) > STRETCHED:
+    if problem.window is not None and problem.window.speed and np.linalg.cond(turn) > STRETCHED:
         text = "is no shape at the goal: there the arms are stretched or folded, and not every direction is open to it"
         raise ConfigError([Fault(path, text, size)])
 

@@ -32,7 +32,6 @@ def catch_shape(problem: Problem, candidate: Candidate) -> Float[Array, "n n"]:
     if problem.catch is not None:
         return jnp.asarray(problem.catch, dtype)
     assert problem.window is not None
-    assert problem.window.speed is not None
     turn = jacobian(partial(problem.window.place, problem.numbers(candidate)), jnp.asarray(problem.goal, dtype))
     n = problem.plant.n
     speeds = np.diag(np.repeat([0.0, problem.window.speed**-2], n // 2))

@@ -86,7 +86,7 @@ def test_a_swing_ends_in_its_window():
 
 GRIPPER = {"window": {"gripper": 0.03}}
 WRONG = {
-    "no speed": (GRIPPER, "acromonk", r"task\.catch\.speed = None: must be a number"),
+    "no speed": (GRIPPER, "acromonk", r"task\.catch\.speed = 0\.0: must be > 0"),
     "a speed alone": ({"speed": 1.0}, "acromonk", r"task\.catch\.speed = 1\.0: must be left away"),
     "a speed in a cycle": (
         {"reset": "brachiation", "speed": 1.0, **GRIPPER},

@@ -159,8 +159,11 @@ class CatchConfig(Settings):
         description="how far the gripper, the free hook of a robot that brachiates, may be from its place at the goal: "
         "with `reset` in the last ellipsoids, else, with `speed`, the catch set itself, instead of half widths [m]",
     )
-    speed: Annotated[float, Field(ge=1e-6, le=1e6)] | None = Field(
-        default=None, description=f"half width of all velocities in the catch set of a `window` [{UNIT}]"
+    speed: float = Field(
+        default=0.0,
+        ge=0,
+        le=1e6,
+        description=f"half width of all velocities in the catch set of a `window` without `reset`; 0: none [{UNIT}]",
     )
 
     @model_serializer(mode="wrap")
@@ -177,9 +180,9 @@ class CatchConfig(Settings):
             yield Problem(("reset",), "must be left away where there are half_widths: the one or the other", self.reset)
         if self.half_widths and self.window:
             yield Problem(("window",), "must be left away where there are half_widths", self.window)
-        if self.window and not self.cyclic and self.speed is None:
-            yield Problem(("speed",), "must be a number: a window without reset is the catch set with it", self.speed)
-        if self.speed is not None and (self.cyclic or not self.window):
+        if self.window and not self.cyclic and not self.speed:
+            yield Problem(("speed",), "must be > 0: a window without reset is the catch set with it", self.speed)
+        if self.speed and (self.cyclic or not self.window):
             yield Problem(("speed",), "must be left away: it belongs to a window without reset", self.speed)
 
     def in_words(self, states: Mapping[str, str]) -> str:
