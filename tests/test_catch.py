@@ -224,13 +224,20 @@ def test_what_goes_on_after_the_last_knot_refuses(run):
     verbs = {
         "disturb": lambda: disturb_run(run, 10, 0, silent()),
         "certify": lambda: certify_run(run, 1, "proved", 1, silent()),
-        "export": lambda: export_run(run, 0, run / "lab", silent()),
         "refine": lambda: refine_run(run, 1, ("gains",), 1, silent()),
     }
     for verb, start in verbs.items():
         with pytest.raises(UserError, match=rf"ends in a catch set \(task\.catch\): rtcd {verb} needs a goal"):
             start()
     assert sorted(path.name for path in run.iterdir()) == ["config.yaml", "elites", "format.json"]
+
+
+@pytest.mark.thorough
+def test_an_export_without_a_funnel_between_its_knots_is_refused(run):
+    """So few knots that the interpolant of S is indefinite between two of them."""
+    with pytest.raises(UserError, match=r"no ellipsoid at t = [\d.]+ s, between two knots: .* trajectory\.knots = 21"):
+        export_run(run, 0, run / "lab", silent())
+    assert not (run / "lab").exists()
 
 
 @pytest.mark.thorough

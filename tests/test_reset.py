@@ -13,20 +13,23 @@ import scipy.linalg
 from rtcd_jax.config.load import load, parse, resolved
 from rtcd_jax.elite.closed_loop import ClosedLoop, outside_limits, runge_kutta
 from rtcd_jax.elite.elite import Elite
-from rtcd_jax.elite.records import resets_in_words
+from rtcd_jax.elite.records import mark_of, resets_in_words
 from rtcd_jax.elite.simulators import mujoco_of
 from rtcd_jax.evaluation import make_evaluate, over_tasks
 from rtcd_jax.genome import initial_genome
 from rtcd_jax.plants import brachiation
 from rtcd_jax.problem import initial_design, make_problem
 from rtcd_jax.reset import closed, values_at_resets
-from rtcd_jax.run.format import arrays_of, common_record, record_of
+from rtcd_jax.run.format import arrays_of, common_arrays, common_record, record_of
 from rtcd_jax.run.optimize import optimize
 from rtcd_jax.run.reevaluation import row
+from rtcd_jax.run.tasks import store_task
 from rtcd_jax.system.cluster import Cluster
 from rtcd_jax.system.errors import ConfigError, UserError
+from rtcd_jax.system.files import replace_json
 from rtcd_jax.types import Evaluation, Funnel, Status, Volumes
 from tests import linear_system as linear
+from tests.analysis.report.runs import run_folder
 from tests.consoles import Output
 from tests.paths import CONFIGS
 
@@ -123,6 +126,19 @@ def test_the_worst_state_of_a_reset_is_named():
 
 
 # ---- AcroMonk
+
+
+def cycle_folder(path):
+    """A finished run's with the robot that was built as its best elite, without a search."""
+    whole = closed(problem(), evaluated(), jax.random.key(1), 100)
+    common = common_arrays(whole), common_record(problem(), whole)
+    folder = run_folder(path, problem().config, common, common, generations=[])
+    replace_json(folder / "format.json", mark_of(problem().config))
+    for i, (name, alone) in enumerate(zip(problem().config.tasks, problem().tasks, strict=True)):
+        one = row(whole.tasks, i)
+        stored = arrays_of(alone, one), record_of(alone, one)
+        store_task(folder, name, alone.config, [stored], stored)
+    return folder
 
 
 def _changed(**sections):

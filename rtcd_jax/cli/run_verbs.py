@@ -274,11 +274,15 @@ class ExportOptions(Options):
 
 
 def export(options: ExportOptions, console: Console) -> Exit:
-    from rtcd_jax.export import export_run
+    from rtcd_jax.elite.records import is_cycle
+    from rtcd_jax.export import export_cycle, export_run
 
+    targets = []
     for folder in _each_task(options.run, console):
-        target = _within(options.to, folder, options.run)
-        export_run(folder, options.elite, target, console, options.name)
+        targets.append(_within(options.to, folder, options.run))
+        export_run(folder, options.elite, targets[-1], console, options.name)
+    if is_cycle(options.run):
+        export_cycle(targets, console)
     return Exit.OK
 
 

@@ -1,7 +1,8 @@
 """`rtcd export`: what a lab needs of one elite, in one folder that stands alone.
 
 Tables, the controller with its funnel monitor in numpy and in C99, test vectors, and the design as MJCF and URDF. All
-mean the closed loop that the run has sampled: x*(t) cubic Hermite, K linear, after t_N the goal's LQR.
+mean the closed loop that the run has sampled: x*(t) cubic Hermite, K linear, after t_N the goal's LQR or, where the
+motion ends in a catch set, nothing.
 """
 
 import contextlib
@@ -19,7 +20,7 @@ import numpy as np
 import yaml
 
 from rtcd_jax.certificate.standing import certificate_path
-from rtcd_jax.elite.records import elite_name, require_held_goal
+from rtcd_jax.elite.records import elite_name
 from rtcd_jax.export import robot, source, tables
 from rtcd_jax.export.bundle import Bundle, read_bundle
 from rtcd_jax.system.console import Console, each_second
@@ -38,11 +39,9 @@ def export_run(folder: Path, elite: int | str, target: Path, console: Console, l
     `label` names the controller's files and symbols, by default after robot and elite.
 
     Raises:
-        UserError: no run folder, no such elite, one without a funnel or with a catch set, or a target that holds
-            something else.
+        UserError: no run folder, no such elite, one without a funnel, or a target that holds something else.
     """
     former = _former(target)
-    require_held_goal(folder, "export")
     bundle = read_bundle(folder, elite_name(elite), label, each_second(console))
     contents = _files(folder, bundle)
     _require_ours(target, former, contents)
@@ -60,6 +59,21 @@ def export_run(folder: Path, elite: int | str, target: Path, console: Console, l
     _mark(target, bundle, complete=True, files=digests)
     for line in _summary(bundle, target, bool(former), changed):
         console.message(line)
+
+
+def export_cycle(targets: Sequence[Path], console: Console) -> None:
+    """Writes `cycle.py` beside the exports of a cycle's tasks, which are in its order: the hand-over between them.
+
+    Raises:
+        UserError: another file has that name, or the folder cannot be written.
+    """
+    path, text = targets[0].parent / "cycle.py", source.template("cycle.py")
+    head = text.splitlines()[0]
+    if path.exists() and not path.read_text(encoding="utf-8", errors="replace").startswith(head):
+        raise UserError(f"{path} is there, and no export has written it: move it away, or choose another folder")
+    names = [(target.name, json.loads((target / MARK).read_bytes())["name"]) for target in targets]
+    replace(path, text.replace("SWINGS = ()", f"SWINGS = {tuple(names)!r}").encode())
+    console.message(f"hand-over from swing to swing: {path}; try it: python {path}")
 
 
 def _former(target: Path) -> dict[str, str]:

@@ -24,6 +24,10 @@ SAMPLED = "V = (x - x*)'S(t)(x - x*) <= rho(t), S cubic Hermite, log rho linear;
 PROVED = "|L(t)^-1 (x - x*(t))| <= 1 with the certificate's L, from its start on and after t_N; before it as sampled"
 
 
+INSTANTS = 10
+"""Of an interval, at which S(t) is looked at."""
+
+
 class Instant(NamedTuple):
     """The loop at one time: x* [n], u* [m], K [m n], and the funnel {x* + axes y : |y| <= 1}, proved or not."""
 
@@ -101,7 +105,7 @@ class Bundle:
             | rates
             | {"state_limits": elite.state_limits, "input_joints": self.joints}
             | proof
-            | {"angles": self.angles}
+            | {"angles": self.angles, "caught": np.array(elite.caught)}
         )
 
     def describe(self) -> dict[str, Any]:
@@ -125,6 +129,7 @@ class Bundle:
             ],
             "convention": self.plant.convention,
             "time": {"unit": "s", "knots": elite.time.size, "dt": elite.time[1], "duration": elite.time[-1]},
+            **({"catch": record["catch"]} if elite.caught else {}),
             "control_rate": {
                 "unit": "Hz",
                 "least": self.control_rate.rate,
@@ -172,20 +177,24 @@ def read_bundle(
     `show(done, of, what)` is called with the progress of a long step.
 
     Raises:
-        UserError: it is not there, cannot be read or has no funnel; a label that is no name in Python and C.
+        UserError: it is not there, cannot be read or has no funnel, at the knots or between them; a label that is no
+            name in Python and C.
     """
     stored = Elite.read(folder, name)
     elite = stored.of_all_robots()
     label = _label(label or f"{elite.plant}_{name}")
     certificate = standing(folder, name, lambda done, of: show(done, of, "checking the certificate"))
     proof = ProvedFunnel.read(certificate_path(folder, name)) if certificate.proved else None
+    funnel = FunnelInterpolant.of(elite)
+    if proof is None:
+        _require_ellipsoids(funnel)
     with jax.enable_x64(True):
         plant, design = plant_of(elite.robot, elite.parameters, elite.design_units)
     model = model_of(elite.robot, elite.parameters)
     return Bundle(
         name=name,
         label=label,
-        funnel=FunnelInterpolant.of(elite),
+        funnel=funnel,
         plant=plant,
         design=design,
         model=model,
@@ -195,6 +204,18 @@ def read_bundle(
         control_rate=control_rate(stored, proof, lambda done, of: show(done, of, "trying control rates")),
         robustness=borne(folder, name),
     )
+
+
+def _require_ellipsoids(funnel: FunnelInterpolant) -> None:
+    """Raises UserError if S(t) is not positive definite somewhere: the monitor's V would mean nothing there."""
+    end, intervals = funnel.elite.time[-1], len(funnel.elite.u)
+    time = np.linspace(0, end, INSTANTS * intervals + 1)
+    bad = time[np.linalg.eigvalsh(funnel.value(time))[:, 0] <= 0]
+    if bad.size:
+        raise UserError(
+            f"the funnel is no ellipsoid at t = {bad[0]:.4g} s, between two knots: the interpolant of S is indefinite "
+            f"there; search with more knots than trajectory.knots = {intervals + 1}"
+        )
 
 
 def _label(text: str) -> str:

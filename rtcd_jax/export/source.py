@@ -19,6 +19,19 @@ NOT_TRIED = (
     "Nothing was tried: `rtcd disturb` on the run simulates wrong models, friction, noise, delay and pushes; export "
     "again afterwards, and what it finds stands here."
 )
+HELD = "afterwards the goal's LQR holds"
+HAND_OVER_HELD = (
+    "Hand over at the goal after {duration} s, while `inside`, to whatever holds the robot there; until then the "
+    "goal's LQR holds it."
+)
+CAUGHT = (
+    "it ends in a catch set, the last ellipsoid: at the end `monitor(duration, x).inside` says whether x is in it, and "
+    "afterwards the input is zero and the monitor advises to stop, whatever the state"
+)
+HAND_OVER_CAUGHT = (
+    "Hand over after {duration} s to what comes next (a grasp, the controller of the next motion), if "
+    "`monitor(duration, x).inside`; of the time after it nothing is promised."
+)
 _CLAIMS = {"controller.py": 'CLAIM = ""', "controller.c": 'claim[] = ""'}
 
 
@@ -35,15 +48,17 @@ def named(text: str, bundle: Bundle) -> str:
 
 
 def _with_claim(name: str, bundle: Bundle) -> str:
-    text = _template(PREFIX + name)
+    text = template(name)
     if bundle.proof and name in _CLAIMS:
         empty = _CLAIMS[name]
         text = text.replace(empty, empty[:-1] + bundle.standing.claim + '"')
     return text
 
 
-def _template(name: str) -> str:
-    return (TEMPLATES / name).read_text(encoding="utf-8")
+def template(name: str) -> str:
+    """The text of a template, by its name without `PREFIX`."""
+    path = TEMPLATES / (name if name == "README.md" else PREFIX + name)
+    return path.read_text(encoding="utf-8")
 
 
 def _size_header(bundle: Bundle) -> str:
@@ -83,6 +98,7 @@ def _data_header(bundle: Bundle) -> str:
         f"#define RTCD_DT {_number(elite.time[1])}",
         f"#define RTCD_DURATION {_number(elite.time[-1])}",
         f"#define RTCD_PIECES {proof.begins.size if proof else 0}",
+        f"#define RTCD_CAUGHT {int(elite.caught)}",
     ]
     definitions = []
     for name, array in arrays.items():
@@ -96,20 +112,22 @@ def _data_header(bundle: Bundle) -> str:
 def readme(bundle: Bundle, described: dict[str, Any]) -> str:
     """The folder's README: what lies where, which way the axes point, what is promised."""
     funnel = described["funnel"]
-    quantities = [*described["states"], *described["inputs"]]
+    quantities, duration = [*described["states"], *described["inputs"]], f"{bundle.elite.time[-1]:.6g}"
     rows = [f"| {item['name']} | {item['unit']} | {_limit(item['limit'])} |" for item in quantities]
     design = ", ".join(
         f"{name} {value:.6g} {bundle.plant.design_units[name]}" for name, value in described["design"].items()
     )
-    return Template(named(_template("README.md"), bundle)).substitute(
+    return Template(named(template("README.md"), bundle)).substitute(
         plant=described["plant"],
         elite=bundle.name,
         config=described["config_hash"],
         design=design,
         convention=bundle.plant.convention,
         quantities="\n".join(rows),
-        duration=f"{bundle.elite.time[-1]:.6g}",
+        duration=duration,
         rate=bundle.control_rate.sentence,
+        afterwards=CAUGHT if bundle.elite.caught else HELD,
+        handover=(HAND_OVER_CAUGHT if bundle.elite.caught else HAND_OVER_HELD).format(duration=duration),
         guarantee=funnel["rung"],
         bears=bundle.robustness or NOT_TRIED,
         promise=_promise(bundle, funnel),

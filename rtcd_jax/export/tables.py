@@ -16,7 +16,7 @@ FARTHEST = 2.5
 ABORT = 4.0
 """Ratio above which the exported monitors advise to abort."""
 LARGEST = sys.float_info.max
-"""The ratio of what is not finite."""
+"""The ratio of what is not finite, and after a catch."""
 
 
 def trajectory(bundle: Bundle) -> str:
@@ -76,6 +76,8 @@ def _vector(bundle: Bundle, t: float, y: np.ndarray) -> np.ndarray:
     elite, now = bundle.elite, bundle.at(t)
     error, ratio = now.axes @ y, y @ y
     x, u = now.x + error, np.clip(now.u - now.gain @ error, -elite.u_max, elite.u_max)
+    if elite.caught and t > elite.time[-1]:
+        return np.array([t, *x, *np.zeros_like(u), LARGEST, False, True, False], float)
     outside = bool((np.abs(x) > elite.state_limits).any())
     return np.array([t, *x, *u, ratio, ratio <= 1 and not outside, ratio > ABORT or outside, now.proved], float)
 

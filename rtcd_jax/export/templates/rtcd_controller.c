@@ -2,7 +2,8 @@
  * and its rates, K linear between K_k and K_k+1; before t_0 the first instant is held; from t_N on
  * u = clip(-K_goal (x - x_goal)). The proved funnel, if there is a certificate, is {x* + L(t) y : |y| <= 1} with the
  * certificate's L, after t_N its region of the goal. The sampled one is {x : V = (x - x*)' S(t) (x - x*) <= rho(t)},
- * S the cubic Hermite interpolant of S_k and its rates, log rho linear. */
+ * S the cubic Hermite interpolant of S_k and its rates, log rho linear. A motion that ends in a catch set is over at t_N:
+ * afterwards the input is zero, and every state counts as outside. */
 #include "rtcd_controller.h"
 
 #include <float.h>
@@ -45,6 +46,12 @@ static int place(double t, double *s)
     return k;
 }
 
+/* Whether the motion has ended in its catch set before t. */
+static int over(double t)
+{
+    return RTCD_CAUGHT && t > RTCD_DURATION;
+}
+
 static double cubic(double s, double start, double start_rate, double end, double end_rate)
 {
     const double r = 1.0 - s;
@@ -71,7 +78,7 @@ void rtcd_control(double t, const double x[RTCD_STATES], double u[RTCD_INPUTS])
 {
     for (int j = 0; j < M; j++)
         u[j] = 0.0;
-    if (!finite_all(&t, 1) || !finite_all(x, N))
+    if (!finite_all(&t, 1) || !finite_all(x, N) || over(t))
         return;
     double s, nominal[N], wanted[M];
     const int k = place(t, &s);
@@ -190,7 +197,7 @@ rtcd_monitor rtcd_watch(double t, const double x[RTCD_STATES], double abort_rati
 #if RTCD_PIECES > 0
     now.proved = t >= RTCD_PROOF_BEGINS[0] * RTCD_DT;
 #endif
-    if (!finite_all(x, N))
+    if (!finite_all(x, N) || over(t))
         return now;
     double s, nominal[N], error[N];
     const int k = place(t, &s);

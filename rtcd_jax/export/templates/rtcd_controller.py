@@ -16,6 +16,9 @@ The proved funnel, if there is a certificate, is {x* + L(t) y : |y| <= 1} with t
 on; after t_N its region of the goal. The sampled one is {x : V = (x - x*)'S(t)(x - x*) <= rho(t)}, S the cubic Hermite
 interpolant of S_k and its rates, log rho linear.
 
+A motion that ends in a catch set (`caught`) is over at t_N, where the sampled funnel is that set: afterwards the input
+is zero, and every state counts as outside.
+
 Where the state, the time or what follows from them is not finite, the input is zero and the state counts as outside.
 """
 
@@ -75,7 +78,7 @@ class Controller:
             self.x_goal, self.goal_gain = stored["x_goal"], stored["K_goal"]
             self.u_max, self.limits, self.joints = stored["u_max"], stored["state_limits"], stored["input_joints"]
             self._begins, self._axes = stored["proof_begins"], stored["proof_axes"]
-            self.angles = stored["angles"]
+            self.angles, self.caught = stored["angles"], bool(stored["caught"])
         self.abort_ratio, self.wrapped = abort_ratio, wrapped
         self.dt, self.duration = float(time[1]), float(time[-1])
         self._log_levels, self._last_value = np.log(levels).tolist(), values[-1] / levels[-1]
@@ -180,6 +183,10 @@ class Controller:
             x[self.angles] -= 2 * np.pi * np.round(error / (2 * np.pi))
         return x
 
+    def over(self, t: float) -> bool:
+        """Whether the motion has ended in its catch set before t."""
+        return self.caught and t > self.duration
+
     def nominal(self, t: float) -> np.ndarray:
         """x*(t) [n] at a finite time; after the motion the goal."""
         return self._nominal(*self._place(t))
@@ -188,7 +195,7 @@ class Controller:
         """Whether x = (positions, velocities), flat or [positions, velocities], is inside the funnel at time t."""
         x = self.unwrap(t, x) if self.wrapped else np.asarray(x, float).reshape(-1)
         proved = bool(len(self._begins) > 0 and np.isfinite(t) and t >= self._begins[0] * self.dt)
-        if not (np.isfinite(x).all() and np.isfinite(t)):
+        if not (np.isfinite(x).all() and np.isfinite(t)) or self.over(t):
             return Monitor(LARGEST, -LARGEST, False, True, proved)
         with np.errstate(over="ignore", invalid="ignore"):  # of absurd states
             k, s = self._place(t)
@@ -243,7 +250,7 @@ class Controller:
         else:
             row = np.array([1.0, s, s * s, s**3]) @ self._table[k]
             nominal, feedforward, gain = row[: len(x)], self.u[k], row[len(x) :].reshape(-1, len(x))
-        if not finite:
+        if not finite or self.over(t):
             return nominal, np.zeros_like(self.u_max)
         with np.errstate(over="ignore", invalid="ignore"):  # of absurd states
             u = feedforward - gain @ (x - nominal)

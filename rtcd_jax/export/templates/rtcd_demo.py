@@ -3,8 +3,8 @@
     python rtcd_controller.py --demo [--seed N] [--headless]
 
 The robot starts from a random state near the boundary of the first ellipsoid and is held at the goal for two seconds
-more. Where there is a display MuJoCo's viewer shows it; where there is none, or with --headless, `demo.svg` has the
-states beside the nominal ones, the inputs with their limits, and V/rho.
+more, unless the motion ends in a catch set. Where there is a display MuJoCo's viewer shows it; where there is none, or
+with --headless, `demo.svg` has the states beside the nominal ones, the inputs with their limits, and V/rho.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ def simulate(folder: Path, seed: int, view: bool):
         data.ctrl[:] = u
         mujoco.mj_step(model, data)
 
-    end = controller.duration + HOLD
+    end = controller.duration - model.opt.timestep / 2 if controller.caught else controller.duration + HOLD
     if not view:
         while data.time < end:
             step()

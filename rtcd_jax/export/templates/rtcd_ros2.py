@@ -11,7 +11,8 @@
 
 Hand-over: it publishes nothing before ~/start, which is refused unless a fresh state lies inside the funnel of t = 0.
 Stop: an advice to abort, a state that is older than `timeout`, or ~/stop publish zero efforts, and go on with them
-until the next start. After the motion the goal is held until it is stopped. The node is no safety function.
+until the next start. After the motion the goal is held until it is stopped, or, if it ends in a catch set, it stops
+by itself. The node is no safety function.
 
 Parameters: `joints`, their names in the order of the states; `states` and `commands`, the topics; `rate` [Hz] of the
 control, by default that of the export; `timeout` [s], by default five periods; `wrapped` and `abort_ratio` as
@@ -120,15 +121,19 @@ class ControllerNode(Node):
             if self._stale():
                 self._stop(f"the last state is older than {self.timeout:g} s")
             else:
-                t = self.now() - self.begun
-                watch = self.controller.monitor(t, self.state)
-                self._ratio.publish(Float64(data=watch.ratio))
-                if watch.abort:
-                    self._stop(f"V/rho = {watch.ratio:.3g} at {t:.3f} s")
-                else:
-                    self._publish(self.controller.control(t, self.state))
+                self._follow(self.now() - self.begun)
         if self.stopped:
             self._publish(np.zeros_like(self.controller.u_max))
+
+    def _follow(self, t: float) -> None:
+        """The input at t of the motion, unless it is over or the monitor advises to stop."""
+        if self.controller.over(t):
+            return self._stop(f"the motion ended in its catch set at {self.controller.duration:.3f} s")
+        watch = self.controller.monitor(t, self.state)
+        self._ratio.publish(Float64(data=watch.ratio))
+        if watch.abort:
+            return self._stop(f"V/rho = {watch.ratio:.3g} at {t:.3f} s")
+        return self._publish(self.controller.control(t, self.state))
 
     def _stale(self) -> bool:
         return self.state is None or self.now() - self.heard > self.timeout

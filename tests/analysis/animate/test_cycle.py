@@ -2,35 +2,18 @@
 
 import itertools
 
-import jax
 import numpy as np
 import pytest
 from PIL import Image, ImageSequence
 
 from rtcd_jax.analysis.animate import animate, cycle
-from rtcd_jax.elite.records import mark_of
-from rtcd_jax.reset import closed
-from rtcd_jax.run.format import arrays_of, common_arrays, common_record, record_of
-from rtcd_jax.run.reevaluation import row
-from rtcd_jax.run.tasks import store_task
-from rtcd_jax.system.files import replace_json
 from tests import test_reset
 from tests.analysis.animate.test_animate import rtcd
-from tests.analysis.report.runs import run_folder
 
 
 @pytest.mark.slow
 def test_the_robot_goes_from_bar_to_bar(tmp_path, backend):
-    problem, whole = test_reset.problem(), test_reset.evaluated()
-    whole = closed(problem, whole, jax.random.key(1), 100)
-    common = common_arrays(whole), common_record(problem, whole)
-    folder = run_folder(tmp_path / "run", problem.config, common, common, generations=[])
-    replace_json(folder / "format.json", mark_of(problem.config))
-    for i, (name, alone) in enumerate(zip(problem.config.tasks, problem.tasks, strict=True)):
-        one = row(whole.tasks, i)
-        stored = arrays_of(alone, one), record_of(alone, one)
-        store_task(folder, name, alone.config, [stored], stored)
-
+    folder = test_reset.cycle_folder(tmp_path / "run")
     course, bars = cycle._course(folder, 0, 4)
     np.testing.assert_allclose(bars, 0.34 * np.arange(-1, 5), rtol=1e-6)
     assert [swing.task for swing in course] == ["heavy_holds", "light_holds"] * 2
