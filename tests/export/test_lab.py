@@ -172,6 +172,21 @@ def test_the_node_swings_up_from_a_fresh_state_inside_the_funnel(export, node):
     assert max(node.published["~/ratio"]) <= 1
 
 
+def test_the_node_stops_with_the_catch(export, node):
+    """By itself, with zero efforts; until then it is that of any motion."""
+    elite = export.bundle.elite
+    node.controller.caught = True
+    say(node, elite.x[0])
+    assert called(node, "~/start").success
+    node.tick()
+    assert np.abs(node.published[COMMANDS][-1]).max() > 0
+    node.nanoseconds = round(1e9 * (elite.time[-1] + node.period))
+    say(node, elite.x_goal)
+    node.tick()
+    assert "catch set" in node.warnings[-1]
+    assert not np.any(node.published[COMMANDS][-1])
+
+
 def test_the_node_refuses_a_start_outside_and_stops_for_good(export, node):
     elite = export.bundle.elite
     say(node, elite.x[0] + 10 * export.bundle.at(0.0).axes[:, 0])
