@@ -19,7 +19,8 @@ import numpy as np
 from scipy.linalg import solve_continuous_are
 
 from rtcd_jax.certificate import check
-from rtcd_jax.certificate.prove.closed_loop import Loop, claim_of, double, linear, with_digests
+from rtcd_jax.certificate.prove.closed_loop import Loop, claim_of, double, with_digests
+from rtcd_jax.certificate.prove.field import linear
 from rtcd_jax.certificate.prove.goal import goal_region
 from rtcd_jax.certificate.prove.levels import goal_level, unit_directions
 from rtcd_jax.certificate.prove.robot import claimed_robot

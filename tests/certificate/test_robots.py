@@ -12,15 +12,8 @@ from rtcd_jax.certificate import check
 from rtcd_jax.certificate.falsify.falsify import Part, summed
 from rtcd_jax.certificate.falsify.simulation import Motions
 from rtcd_jax.certificate.prove.certify import certify_elite
-from rtcd_jax.certificate.prove.closed_loop import (
-    ControlPoints,
-    claim_of,
-    double,
-    doubles,
-    rate,
-    robot_record,
-    with_digests,
-)
+from rtcd_jax.certificate.prove.closed_loop import claim_of, double, doubles, robot_record, with_digests
+from rtcd_jax.certificate.prove.field import ControlPoints, rate
 from rtcd_jax.certificate.prove.robot import claimed_robot
 from rtcd_jax.certificate.prove.uncertainty import bounds_of
 from rtcd_jax.certificate.standing import difference, standing, standing_of

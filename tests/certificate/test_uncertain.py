@@ -14,7 +14,7 @@ from rtcd_jax.certificate.check import Q, Refused
 from rtcd_jax.certificate.falsify.falsify import Part, summed
 from rtcd_jax.certificate.falsify.simulation import Motions
 from rtcd_jax.certificate.prove.certify import certify_elite
-from rtcd_jax.certificate.prove.closed_loop import ControlPoints, rate
+from rtcd_jax.certificate.prove.field import ControlPoints, rate
 from rtcd_jax.certificate.standing import standing, standing_of
 from rtcd_jax.cli import main as cli
 from rtcd_jax.elite.elite import Elite
@@ -196,7 +196,8 @@ def test_every_input_lies_between_the_two_laws(content):
     weak, strong, error, w = 2.0, 2.5, 0.3, 0.1
     claim = claim._replace(limits=(Q(2), Q(5, 2)), disturbance=Q(1, 10))
     space = check.Space(2, 2, 2)
-    cases = check.cases_of(space, claim, Q(3, 10), Q(1), space.y(0) * Q(4), Q(16), Q(-1), Q(1))
+    asked = check.Feedback(space.y(0) * Q(4), Q(16), space.poly(0))
+    cases = check.cases_of(space, claim, Q(3, 10), Q(1), asked, Q(-1), Q(1))
     assert {name[:-1] for name in cases} == {"free", "high", "low"}
     dice = np.random.default_rng(0)
     for _ in range(300):

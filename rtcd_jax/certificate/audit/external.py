@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from rtcd_jax.certificate.prove.closed_loop import linear, rate
+from rtcd_jax.certificate.prove.field import linear, rate
 from rtcd_jax.certificate.prove.robot import ClaimedRobot, robot_of
 from rtcd_jax.config.load import load
 from rtcd_jax.config.plants import PLANTS, PackagedPlant, RobotPlant

@@ -63,7 +63,7 @@ Every number of a file is an exact double in hexadecimal notation. Digests show 
 does not rest on them.
 """
 
-from rtcd_jax.certificate.check.claim import Claim
+from rtcd_jax.certificate.check.claim import Claim, Shift
 from rtcd_jax.certificate.check.command import SECONDS, main, within
 from rtcd_jax.certificate.check.delay import jumps_within_reach, lateness
 from rtcd_jax.certificate.check.exact import (
@@ -87,17 +87,27 @@ from rtcd_jax.certificate.check.funnel import (
     Motion,
     funnel_delay,
     funnel_jump,
+    funnel_models,
     funnel_obligations,
     funnel_speed,
     motion,
+    obligations_of,
     require_bounds,
     require_jump,
     require_kept_out,
 )
-from rtcd_jax.certificate.check.goal import GoalField, Shell, goal_delay, goal_field, goal_obligations, goal_speed
+from rtcd_jax.certificate.check.goal import (
+    GoalField,
+    Shell,
+    goal_delay,
+    goal_field,
+    goal_obligations,
+    goal_speed,
+    last_centers,
+)
 from rtcd_jax.certificate.check.keep_out import Ellipsoid, HalfSpace
 from rtcd_jax.certificate.check.matrix import cofactors
-from rtcd_jax.certificate.check.push import cube, push_clearance, require_push
+from rtcd_jax.certificate.check.push import push_clearance, require_push
 from rtcd_jax.certificate.check.robot import (
     HINGE,
     SLIDE,
@@ -109,7 +119,7 @@ from rtcd_jax.certificate.check.robot import (
     mass_is_definite,
     numbers_of,
 )
-from rtcd_jax.certificate.check.saturation import cases_of, error_under, input_error
+from rtcd_jax.certificate.check.saturation import Case, Feedback, cases_of, error_under, input_error
 from rtcd_jax.certificate.check.squares import (
     GramCertificate,
     Obligation,

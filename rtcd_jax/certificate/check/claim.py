@@ -2,9 +2,21 @@
 
 from typing import Any, NamedTuple
 
+from rtcd_jax.certificate.check.exact import Q
 from rtcd_jax.certificate.check.keep_out import Ellipsoid
 from rtcd_jax.certificate.check.robot import Equations, Robot
 from rtcd_jax.certificate.check.taylor import Space
+
+
+class Shift(NamedTuple):
+    """A part of c_p - x*: a product of powers of p, by the claim's `uncertain` numbers, times the cubics with values
+    `x` [N+1 n] at the knots and `rates` [N 2 n] at both ends of their intervals. p goes from -1 to 1 as its number does
+    from its least to its largest value.
+    """
+
+    powers: tuple[int, ...]
+    x: list
+    rates: list
 
 
 class Claim(NamedTuple):
@@ -14,7 +26,8 @@ class Claim(NamedTuple):
     `disturbance` bounds |w(t)|, `noise` [n] the errors of the measured state, `age` [s] how old a measurement that acts
     is, `speed` [input/s] how fast the feedback changes. Where old measurements count to first order (delay.py), `jerk`
     [input/s^2], `reaction` [1/s] and, by knot, `jumps` [input/s] bound how that changes; else `jerk` is None. A motion
-    on x* survives an impulse of |J| <= `push` [input s] on the motor. No motion enters the sets of `keep_out`.
+    on x* survives an impulse of |J| <= `push` [input s] on the motor. No motion enters the sets of `keep_out`. With
+    `shifts` the robot's numbers are constant, and each robot p has its funnel about c_p instead of x*.
     """
 
     equations: Equations
@@ -38,6 +51,7 @@ class Claim(NamedTuple):
     start: tuple[int, Any]
     push: Any
     keep_out: list = []  # noqa: RUF012 (of a tuple's field)
+    shifts: tuple[Shift, ...] = ()
 
     @property
     def robot(self) -> Robot:
@@ -67,8 +81,18 @@ class Claim(NamedTuple):
         """Whether old measurements count to first order."""
         return self.jerk is not None
 
-    def space(self, s_order: int, y_order: int) -> Space:
-        return Space(self.n, s_order, y_order, len(self.uncertain))
+    @property
+    def constant(self) -> bool:
+        """Whether the robot's numbers do not vary in time."""
+        return self.first_order or bool(self.shifts)
+
+    @property
+    def cube(self) -> dict[int, tuple[Any, Any]]:
+        """All instants of an interval and all robots, by the places of their variables."""
+        return {i: (Q(-1), Q(1)) for i in (0, *range(self.n + 1, self.n + 1 + len(self.uncertain)))}
+
+    def space(self, s_order: int, y_order: int, stride: int = 0) -> Space:
+        return Space(self.n, s_order, y_order, len(self.uncertain), stride)
 
     def numbers(self, space: Space) -> dict[str, Any]:
         """The robot's numbers by name: an exact one, or all between its bounds."""

@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from rtcd_jax.certificate.check.claim import Claim
+from rtcd_jax.certificate.check.claim import Claim, Shift
 from rtcd_jax.certificate.check.exact import (
     MAX_BYTES,
     MAX_FURTHER,
@@ -45,6 +45,8 @@ MOST_JOINTS, MOST_TERMS_OF_ROBOT, HIGHEST = 4, 200, 8
 """Of a robot; wave numbers and powers are at most `HIGHEST`."""
 MOST_UNCERTAIN = 6
 """Numbers of a robot."""
+MOST_SHIFTS, HIGHEST_SHIFT = 20, 3
+"""Of the centers' parts, and the highest power of a number in one."""
 _CASE = re.compile(r"(free|high|low)[-+]?(late)?(/[0-9]{1,3}(,[0-9]{1,3})*)?")
 _DOUBLE = re.compile(r"-?0x[01](\.[0-9a-f]{1,13})?p[+-][0-9]{1,4}")
 
@@ -136,10 +138,12 @@ def read_claim(node: Node) -> Claim:
         return _read_claim_1(node)
     first_order = isinstance(node.value, dict) and "jerk" in node.value
     kept_out = isinstance(node.value, dict) and "keep_out" in node.value
+    shifted = isinstance(node.value, dict) and "shifts" in node.value
     names = (
         *("robot", "parameters", "limit", "disturbance", "noise", "age", "speed", *_LOOP, "push"),
         *(("jerk", "reaction", "jumps") if first_order else ()),
         *(("keep_out",) if kept_out else ()),
+        *(("shifts",) if shifted else ()),
     )
     entries: dict[str, Node] = dict(zip(names, node.keys(*names), strict=True))
     node.require_digests()
@@ -173,7 +177,24 @@ def read_claim(node: Node) -> Claim:
         if first_order
         else [],
         keep_out=[_read_set(each, n) for each in entries["keep_out"].items(at_least=1)] if kept_out else [],
+        shifts=_read_shifts(entries["shifts"], parameters, len(entries["x"].items()), n) if shifted else (),
     )
+
+
+def _read_shifts(node: Node, parameters: Mapping[str, tuple[Any, Any]], knots: int, n: int) -> tuple[Shift, ...]:
+    uncertain = sorted(name for name, (low, high) in parameters.items() if low < high)
+    shifts = []
+    for each in node.items(at_least=1):
+        powers, x, rates = each.keys("powers", "x", "rates")
+        each.require_digests()
+        by_name = {name: power.integer(1, HIGHEST_SHIFT) for name, power in powers.named()}
+        powers.require(by_name.keys() <= set(uncertain) and bool(by_name), f"must be of {', '.join(uncertain)[:80]}")
+        values = x.array(knots, n)
+        x.items()[0].require(all(value == 0 for value in values[0]), "must be zero: all robots begin about x*(0)")
+        shifts.append(Shift(tuple(by_name.get(name, 0) for name in uncertain), values, rates.array(knots - 1, 2, n)))
+    node.require(len(shifts) <= MOST_SHIFTS, f"has {len(shifts)} entries, must have at most {MOST_SHIFTS}")
+    node.require(len({shift.powers for shift in shifts}) == len(shifts), "has the same powers twice")
+    return tuple(shifts)
 
 
 def _read_set(node: Node, n: int) -> HalfSpace | Ellipsoid:
@@ -327,9 +348,14 @@ def _read_monomials(node: Node, n: int) -> tuple[tuple[int, ...], ...]:
     return tuple(tuple(power.integer(0, MAX_ORDER // 2) for power in each.items(n)) for each in items)
 
 
-def require_few_terms(node: Node, n: int, s_order: int, y_order: int) -> None:
-    """A polynomial of these orders in s and y must be small enough to be multiplied in seconds."""
-    terms = (s_order + 1) * math.comb(y_order + n, n)
+def require_few_terms(node: Node, n: int, s_order: int, y_order: int, of_robots: tuple[int, int] = (0, 1)) -> None:
+    """A polynomial of these orders in s, in y and in so many numbers, a power of which counts as so many of y, must be
+    small enough to be multiplied in seconds.
+    """
+    m, stride = of_robots
+    powers = range(y_order // stride + 1) if m else range(1)
+    each = [math.comb(max(m + k - 1, 0), k) * math.comb(y_order - stride * k + n, n) for k in powers]
+    terms = (s_order + 1) * sum(each)
     node.require(terms <= MAX_TERMS, f"asks for polynomials of {terms} terms, must be at most {MAX_TERMS}")
 
 
@@ -340,11 +366,12 @@ def read_interval(node: Node, claim: Claim) -> Interval:
     )
     node.require_digests()
     n = claim.n
-    pair = [order.integer(1, MAX_ORDER - 1) for order in orders.items(2)]
-    require_few_terms(orders, n, *pair)
+    pair = [order.integer(1, MAX_ORDER - 1) for order in orders.items(4 if claim.shifts else 2)]
+    of_robots = (len(claim.uncertain), pair[2]) if claim.shifts else (0, 1)
+    require_few_terms(orders, n, pair[0], pair[1], of_robots)
     interval = Interval(
         knot.integer(0, len(claim.u) - 1), start.number(), end.number(), first.array(n, n), last.array(n, n),
-        bend.array(2, n, n), (pair[0], pair[1]), read_cases(cases, n), more[0].array(2, n) if claim.first_order else [],
+        bend.array(2, n, n), tuple(pair), read_cases(cases, n), more[0].array(2, n) if claim.first_order else [],
         _read_sides(more[-1], claim, 2) if claim.ellipsoids else [],
     )  # fmt: skip
     node.require(

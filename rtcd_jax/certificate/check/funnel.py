@@ -17,16 +17,18 @@ from rtcd_jax.certificate.check.delay import Bounds as DelayBounds
 from rtcd_jax.certificate.check.exact import Q, alternating, near, require, rounded
 from rtcd_jax.certificate.check.keep_out import half_spaces
 from rtcd_jax.certificate.check.matrix import cofactors, dot
-from rtcd_jax.certificate.check.saturation import Case, cases_of, input_error
-from rtcd_jax.certificate.check.squares import GramCertificate, Obligation, control_points, is_positive
-from rtcd_jax.certificate.check.taylor import Taylor, polynomial, sine_and_cosine, terms_of
+from rtcd_jax.certificate.check.saturation import Case, Feedback, cases_of, input_error
+from rtcd_jax.certificate.check.squares import GramCertificate, Obligation, control_points, economized, is_positive
+from rtcd_jax.certificate.check.taylor import Space, Taylor, polynomial, sine_and_cosine, terms_of
 
 WHOLE = {0: (Q(-1), Q(1))}
 """s on an interval."""
 
 
 class Motion(NamedTuple):
-    """One interval's data as polynomials in s: x*, x*' [1/s], K, K' [1/s], u, L and L' [1/s]."""
+    """One interval's data as polynomials in s: x*, x*' [1/s], K, K' [1/s], u, L and L' [1/s]; c_p - x* and its rate
+    [1/s], in the robot's numbers too.
+    """
 
     state: list
     rate: list
@@ -35,11 +37,25 @@ class Motion(NamedTuple):
     input: Any
     axes: list
     axes_rate: list
+    shift: list
+    shift_rate: list
     duration: Any
+
+    @property
+    def center(self) -> list:
+        return [a + b for a, b in zip(self.state, self.shift, strict=True)]
+
+    def apart(self, error: list) -> list:
+        """x - x* at the states c_p + error."""
+        return [a + b for a, b in zip(self.shift, error, strict=True)]
 
 
 class Interval(NamedTuple):
-    """One interval of the funnel: L(s) between its ends is linear plus (1 - s^2) (bend_0 + bend_1 s)."""
+    """One interval of the funnel: L(s) between its ends is linear plus (1 - s^2) (bend_0 + bend_1 s).
+
+    `orders` are those of its Taylor models in s and y; about own motions also how many powers of y one of a robot's
+    number counts for, and the degree in each of them that stays.
+    """
 
     knot: int
     start: Any
@@ -47,24 +63,35 @@ class Interval(NamedTuple):
     first: list
     last: list
     bend: list
-    orders: tuple[int, int]
+    orders: tuple[int, ...]
     cases: dict[str, GramCertificate]
     late: list
     """rho of delay.py at both ends, linear in between, where old measurements count to first order."""
     sides: list = []  # noqa: RUF012 (of a tuple's field)
     """Of every ellipsoid to keep out of, the side of keep_out.py at both ends."""
 
+    def space(self, claim: Claim) -> Space:
+        return claim.space(*self.orders[:3])
+
 
 def motion(claim: Claim, interval: Interval) -> Motion:
     """The closed loop's and the funnel's data on one interval."""
-    k, dt, space = interval.knot, claim.dt, claim.space(*interval.orders)
+    k, dt, space = interval.knot, claim.dt, interval.space(claim)
     half = (interval.end - interval.start) / 2
     fraction = space.s * half + space.poly((interval.start + interval.end) / 2)  # of the knots' interval, at s
     speed = 1 / (dt * half)  # ds/dt
-    state = []
-    for a, va, b, vb in zip(claim.x[k], claim.rates[k][0], claim.x[k + 1], claim.rates[k][1], strict=True):
-        hermite = [a, dt * va, 3 * (b - a) - dt * (2 * va + vb), 2 * (a - b) + dt * (va + vb)]
-        state.append(space.compose(hermite, fraction))
+
+    def cubics(x: list, rates: list) -> list:
+        parts = []
+        for a, va, b, vb in zip(x[k], rates[k][0], x[k + 1], rates[k][1], strict=True):
+            hermite = [a, dt * va, 3 * (b - a) - dt * (2 * va + vb), 2 * (a - b) + dt * (va + vb)]
+            parts.append(space.compose(hermite, fraction))
+        return parts
+
+    state, shift = cubics(claim.x, claim.rates), [space.poly(0)] * claim.n
+    for powers, x, rates in claim.shifts:
+        product = space.of_the_robot(powers)
+        shift = [a + b * product for a, b in zip(shift, cubics(x, rates), strict=True)]
     gain = [space.compose([a, b - a], fraction) for a, b in zip(claim.K[k], claim.K[k + 1], strict=True)]
     axes = []
     for first, last, bend0, bend1 in zip(interval.first, interval.last, *interval.bend, strict=True):
@@ -72,42 +99,58 @@ def motion(claim: Claim, interval: Interval) -> Motion:
         for a, b, c, d in zip(first, last, bend0, bend1, strict=True):
             row.append(space.compose([(a + b) / 2 + c, (b - a) / 2 + d, -c, -d], space.s))
         axes.append(row)
-    rate, gain_rate = ([space.derivative(a) * speed for a in each] for each in (state, gain))
+    rate, gain_rate, shift_rate = ([space.derivative(a) * speed for a in each] for each in (state, gain, shift))
     axes_rate = [[space.derivative(a) * speed for a in row] for row in axes]
-    return Motion(state, rate, gain, gain_rate, claim.u[k], axes, axes_rate, 2 / speed)
+    return Motion(state, rate, gain, gain_rate, claim.u[k], axes, axes_rate, shift, shift_rate, 2 / speed)
 
 
 def funnel_obligations(claim: Claim, interval: Interval, place: str) -> dict[str, Obligation]:
     """By case of the input and, behind a slash, control point of the robots."""
-    data, space = motion(claim, interval), claim.space(*interval.orders)
+    return obligations_of(claim, funnel_models(claim, interval, place), *interval.orders[3:])
+
+
+def obligations_of(
+    claim: Claim, models: Mapping[str, tuple[Case, Taylor]], degree: int | None = None
+) -> dict[str, Obligation]:
+    """As `funnel_obligations`; polynomials are of at most this `degree` in each of the robot's numbers."""
+    obligations = {}
+    for name, (case, q) in models.items():
+        p, changed = (q.p, Q(0)) if degree is None else economized(q.p, claim.n, degree)
+        obligations |= for_all_robots(name, case, p, q.r + q.d + changed, Q(0), WHOLE[0], claim)
+    return obligations
+
+
+def funnel_models(claim: Claim, interval: Interval, place: str) -> dict[str, tuple[Case, Taylor]]:
+    """By case of the input, what must be positive there."""
+    data, space = motion(claim, interval), interval.space(claim)
     adjugate, determinant = cofactors(data.axes)
     require(is_positive(determinant, WHOLE), place, "an ellipsoid is degenerate: det L must be > 0")
     if claim.age != 0:
         require_speed(claim, funnel_speed(claim, interval, place), place)
     y = [space.y(i) for i in range(claim.n)]
-    error, field = field_around(claim, space, data.state, data.axes, place)
+    error, field = field_around(claim, space, data.center, data.axes, place)
     scaled = [dot(column, y) for column in zip(*adjugate, strict=True)]
     push = pushes(field, scaled, Taylor(space, determinant).constant, place)
-    drag = [Taylor(space, a + dot(row, y)).tidy() for a, row in zip(data.rate, data.axes_rate, strict=True)]
+    drag = [
+        Taylor(space, a + b + dot(row, y)).tidy()
+        for a, b, row in zip(data.rate, data.shift_rate, data.axes_rate, strict=True)
+    ]
     relative = [a - field.d * slow for a, slow in zip(field.a, drag, strict=True)]
     free, forced = pushed(push, relative), pushed(push, field.b)
-    linear = dot(data.gain, error) * Q(-1)
-    by_axis = [dot(data.gain, column) for column in zip(*data.axes, strict=True)]
+
+    def feedback(gain: list) -> Feedback:
+        by_axis = [dot(gain, column) for column in zip(*data.axes, strict=True)]
+        return Feedback(dot(gain, error) * Q(-1), dot(by_axis, by_axis), dot(gain, data.shift) * Q(-1))
+
     late, oldest = input_error(claim, interval.knot), None
     if claim.first_order:
         row = late_row(space, interval)
         bounds = delay_bounds(claim, along(claim, data, field, error), late, _models(space, row), place)
         require_delay(claim, bounds, place)
         late = lateness(claim, late, bounds.misfit, jumps_within_reach(claim, interval.knot, interval.start))
-        older = [row_i * claim.age - gain for row_i, gain in zip(row, data.gain, strict=True)]
-        by_older = [dot(older, column) for column in zip(*data.axes, strict=True)]
-        oldest = dot(older, error), dot(by_older, by_older)
-    obligations = {}
-    squared = dot(by_axis, by_axis)
-    for name, case in cases_of(space, claim, late, data.input, linear, squared, Q(-1), Q(1), oldest).items():
-        total = (free + forced * Taylor(free.space, case.input)) * Q(-1)
-        obligations |= for_all_robots(name, case, total.p, total.r + total.d, Q(0), WHOLE[0], claim)
-    return obligations
+        oldest = feedback([gain - row_i * claim.age for row_i, gain in zip(row, data.gain, strict=True)])
+    cases = cases_of(space, claim, late, data.input, feedback(data.gain), Q(-1), Q(1), oldest)
+    return {name: (case, (free + forced * Taylor(free.space, case.input)) * Q(-1)) for name, case in cases.items()}
 
 
 def for_all_robots(
@@ -186,10 +229,10 @@ def pushed(push: list[Taylor], field: list[Taylor]) -> Taylor:
 
 def funnel_speed(claim: Claim, interval: Interval, place: str) -> Any:
     """An upper bound of |d/dt (K e)| in the ellipsoids of an interval, e = x - x*."""
-    data, space = motion(claim, interval), claim.space(*interval.orders)
-    error, field = field_around(claim, space, data.state, data.axes, place)
+    data, space = motion(claim, interval), interval.space(claim)
+    error, field = field_around(claim, space, data.center, data.axes, place)
     rate = [a - field.d * Taylor(space, slow) for a, slow in zip(field.a, data.rate, strict=True)]
-    turning = dot([Taylor(space, gain) for gain in data.gain_rate], [Taylor(space, e) for e in error])
+    turning = dot([Taylor(space, gain) for gain in data.gain_rate], [Taylor(space, e) for e in data.apart(error)])
     return turning.largest + speed_of(claim, field, [Taylor(space, gain) for gain in data.gain], rate, place)
 
 
@@ -200,8 +243,8 @@ def late_row(space: Any, interval: Interval) -> list:
 
 def funnel_delay(claim: Claim, interval: Interval, place: str) -> DelayBounds:
     """The bounds of delay.py on the ellipsoids of an interval."""
-    data, space = motion(claim, interval), claim.space(*interval.orders)
-    error, field = field_around(claim, space, data.state, data.axes, place)
+    data, space = motion(claim, interval), interval.space(claim)
+    error, field = field_around(claim, space, data.center, data.axes, place)
     late, row = input_error(claim, interval.knot), _models(space, late_row(space, interval))
     return delay_bounds(claim, along(claim, data, field, error), late, row, place)
 
@@ -212,7 +255,7 @@ def along(claim: Claim, data: Motion, field: Field, error: list) -> Along:
     speed = 2 / data.duration
     bend = [space.derivative(rate) * speed for rate in data.rate]
     e, gain, gain_rate, rate, bent = (
-        _models(space, part) for part in (error, data.gain, data.gain_rate, data.rate, bend)
+        _models(space, part) for part in (data.apart(error), data.gain, data.gain_rate, data.rate, bend)
     )
     return scaled_along(field, e, gain, gain_rate, rate, bent, data.input)
 
@@ -233,10 +276,15 @@ def require_jump(claim: Claim, interval: Interval, place: str) -> None:
 
 def funnel_jump(claim: Claim, interval: Interval, place: str) -> Any:
     """The bound of the jump at the knot where an interval begins."""
-    space, k = claim.space(*interval.orders), interval.knot
-    error, field = field_around(claim, space, map(space.poly, claim.x[k]), interval.first, place)
+    space, k = interval.space(claim), interval.knot
+    shift = [space.poly(0)] * claim.n
+    for powers, x, _ in claim.shifts:
+        shift = [a + space.of_the_robot(powers) * b for a, b in zip(shift, x[k], strict=True)]
+    center = [space.poly(a) + b for a, b in zip(claim.x[k], shift, strict=True)]
+    error, field = field_around(claim, space, center, interval.first, place)
+    apart = [a + b for a, b in zip(shift, error, strict=True)]
     gain = [Taylor(space, space.poly(each)) for each in claim.K[k]]
-    here = scaled_along(field, _models(space, error), gain, gain, gain, gain, claim.u[k])
+    here = scaled_along(field, _models(space, apart), gain, gain, gain, gain, claim.u[k])
     return jump_bound(claim, here, k, place)
 
 
@@ -253,30 +301,31 @@ def require_speed(claim: Claim, fastest: Any, place: str) -> None:
 
 
 def require_bounds(claim: Claim, data: Motion, place: str) -> None:
-    """|x_i| <= bound: (bound -+ x*_i)^2 > |row i of L|^2 and bound -+ x*_i > 0."""
+    """|x_i| <= bound: (bound -+ c_i)^2 > |row i of L|^2 and bound -+ c_i > 0, c the center."""
+    center, space = data.center, claim.space(0, 0)
     for i, bound in enumerate(claim.bounds):
         if bound is None:
             continue
         for sign in (1, -1):
-            left = data.state[i] * Q(sign) + claim.space(0, 0).poly(bound)
+            left = center[i] * Q(sign) + space.poly(bound)
             clearance = left * left - dot(data.axes[i], data.axes[i])
-            inside = is_positive(left, WHOLE) and is_positive(clearance, WHOLE)
+            inside = is_positive(left, claim.cube) and is_positive(clearance, claim.cube)
             name = claim.robot.states[i]
             require(inside, place, f"the limit |{name}| <= {rounded(bound):.6g} {claim.robot.units[i]} is not kept")
 
 
 def require_kept_out(claim: Claim, interval: Interval, data: Motion, place: str) -> None:
     """The ellipsoids meet no half space w'(x - c) > offset that holds a set to keep out of:
-    (offset - w'(x* - c))^2 > |L'w|^2 and offset - w'(x* - c) > 0.
+    (offset - w'(c_p - c))^2 > |L'w|^2 and offset - w'(c_p - c) > 0.
     """
-    space = claim.space(*interval.orders)
+    space = interval.space(claim)
     sides = [
         ([space.compose([(a + b) / 2, (b - a) / 2], space.s) for a, b in zip(*ends, strict=True)], ends)
         for ends in interval.sides
     ]
     for i, (normal, center, offset) in enumerate(half_spaces(claim.keep_out, sides)):
-        apart = [space.poly(c) - x for c, x in zip(center, data.state, strict=True)]
+        apart = [space.poly(c) - x for c, x in zip(center, data.center, strict=True)]
         left = dot(apart, normal) + space.poly(offset)
         turned = [dot(column, normal) for column in zip(*data.axes, strict=True)]
-        outside = is_positive(left, WHOLE) and is_positive(left * left - dot(turned, turned), WHOLE)
+        outside = is_positive(left, claim.cube) and is_positive(left * left - dot(turned, turned), claim.cube)
         require(outside, place, f"the set claim.keep_out[{i}] is not kept out of")

@@ -1,5 +1,6 @@
 """The obligations of the goal region, level by level, and of the funnel's end inside it."""
 
+import itertools
 import math
 from typing import Any, NamedTuple
 
@@ -18,8 +19,8 @@ from rtcd_jax.certificate.check.funnel import (
     speed_of,
 )
 from rtcd_jax.certificate.check.matrix import cofactors, dot
-from rtcd_jax.certificate.check.saturation import cases_of, error_under
-from rtcd_jax.certificate.check.squares import GramCertificate, Obligation, is_positive_definite
+from rtcd_jax.certificate.check.saturation import Feedback, cases_of, error_under
+from rtcd_jax.certificate.check.squares import GramCertificate, Obligation, basis_change, is_positive_definite
 from rtcd_jax.certificate.check.taylor import Taylor, terms_of
 
 MOST_TURNS = 10**6
@@ -109,15 +110,15 @@ def goal_obligations(claim: Claim, field: GoalField, low, high) -> dict[str, Obl
     free, forced, gain, late, older = field
     space = free.space
 
-    def asked(row: list) -> tuple[Any, Any]:
-        return dot([space.y(j) for j in range(claim.n)], row) * Q(-1), space.s * space.s * dot(row, row)
+    def by_level(row: list) -> Any:
+        return dot([space.y(j) for j in range(claim.n)], row) * Q(-1)
 
-    (linear, squared), oldest = asked(gain), None
-    if older is not None:
-        linear_then, squared_then = asked(older)
-        oldest = linear_then * space.s, squared_then
-    obligations = {}
-    for name, case in cases_of(space, claim, late, Q(0), linear * space.s, squared, low, high, oldest).items():
+    def asked(row: list) -> Feedback:
+        return Feedback(by_level(row) * space.s, space.s * space.s * dot(row, row), space.poly(0))
+
+    oldest = None if older is None else asked(older)
+    linear, obligations = by_level(gain), {}
+    for name, case in cases_of(space, claim, late, Q(0), asked(gain), low, high, oldest).items():
         if case.saturated or claim.moves_the_goal:
             held = free + forced * Taylor(space, case.input)
             p, error, drift = held.p * Q(-1), held.r * high + held.d, Q(0)
@@ -130,12 +131,30 @@ def goal_obligations(claim: Claim, field: GoalField, low, high) -> dict[str, Obl
 
 
 def require_arrival(claim: Claim, outlet: list, axes: list, weight, place: str) -> None:
-    """E(t_N) in G: |adj(L_g) (x_N - x_g + L_N y)| < det L_g for |y| <= 1, by the S-lemma with the given weight."""
+    """E(t_N) in G: |adj(L_g) (c - x_g + L_N y)| < det L_g for |y| <= 1, by the S-lemma with the given weight.
+
+    The centers c for which that holds are convex: it is enough to look at the control points of c_p over the robots.
+    """
     adjugate, determinant = cofactors(axes)
-    offset = [a - b for a, b in zip(claim.x[-1], claim.x_goal, strict=True)]
-    columns = [[dot(row, column) for row in adjugate] for column in (*zip(*outlet, strict=True), offset)]
-    form = [[-dot(p, q) for q in columns] for p in columns]
-    for i in range(claim.n):
-        form[i][i] += weight
-    form[-1][-1] += determinant * determinant - weight
-    require(is_positive_definite(form), place, "the funnel's outlet is not shown to lie in the goal region")
+    for center in last_centers(claim):
+        offset = [a - b for a, b in zip(center, claim.x_goal, strict=True)]
+        columns = [[dot(row, column) for row in adjugate] for column in (*zip(*outlet, strict=True), offset)]
+        form = [[-dot(p, q) for q in columns] for p in columns]
+        for i in range(claim.n):
+            form[i][i] += weight
+        form[-1][-1] += determinant * determinant - weight
+        require(is_positive_definite(form), place, "the funnel's outlet is not shown to lie in the goal region")
+
+
+def last_centers(claim: Claim) -> list[list]:
+    """The Bernstein control points of c_p(t_N) over the robots."""
+    degrees = [max(each) for each in zip(*(shift.powers for shift in claim.shifts), strict=True)]
+    changes = [basis_change(degree, degree, Q(-1), Q(1)) for degree in degrees]
+    centers = []
+    for place in itertools.product(*(range(degree + 1) for degree in degrees)):
+        center = claim.x[-1]
+        for powers, x, _ in claim.shifts:
+            weight = math.prod((rows[k][j] for rows, k, j in zip(changes, powers, place, strict=True)), start=Q(1))
+            center = [a + weight * b for a, b in zip(center, x[-1], strict=True)]
+        centers.append(center)
+    return centers

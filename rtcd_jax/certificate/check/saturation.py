@@ -13,10 +13,19 @@ from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 from rtcd_jax.certificate.check.claim import Claim
-from rtcd_jax.certificate.check.exact import Q
 from rtcd_jax.certificate.check.matrix import dot
 from rtcd_jax.certificate.check.squares import is_positive
 from rtcd_jax.certificate.check.taylor import Space
+
+
+class Feedback(NamedTuple):
+    """What u_lin is beside the feed-forward: `linear` in y, with |linear|^2 <= `squared` on the sphere, and an `offset`
+    that is the robot's own.
+    """
+
+    linear: Any
+    squared: Any
+    offset: Any
 
 
 class Case(NamedTuple):
@@ -44,38 +53,42 @@ def cases_of(
     claim: Claim,
     error,
     feedforward,
-    linear,
-    bound_squared,
+    feedback: Feedback,
     low,
     high,
-    oldest: tuple[Any, Any] | None = None,
+    oldest: Feedback | None = None,
 ) -> dict[str, Case]:
-    """By name, for u_lin = feedforward + linear: "free", "high" and "low", each with "-" and "+" where the laws differ.
+    """By name: "free", "high" and "low", each with "-" and "+" where the laws differ; s in [low, high].
 
-    |linear|^2 <= bound_squared on the sphere, for s in [low, high]. What cannot occur is left out. `oldest` has both
-    for the oldest measurement, where these count to first order: the cases "late" are those of its laws.
+    What cannot occur is left out. The conditions are those of all robots together: each holds where it does for one.
+    `oldest` is the feedback of the oldest measurement, where these count to first order: the cases "late" are those of
+    its laws.
     """
     if oldest is not None:
-        now = cases_of(space, claim, error, feedforward, linear, bound_squared, low, high)
-        then = cases_of(space, claim, error, feedforward, *oldest, low, high)
+        now = cases_of(space, claim, error, feedforward, feedback, low, high)
+        then = cases_of(space, claim, error, feedforward, oldest, low, high)
         return now | {f"{name}late": case for name, case in then.items()}
     weak, strong = claim.limits
-    w = claim.disturbance
+    w, linear, apart = claim.disturbance, feedback.linear, space.size(feedback.offset)
     laws = {"-": (-error, strong, weak, -w), "+": (error, weak, strong, w)}
     if error == 0 and weak == strong and w == 0:
         laws = {"": laws["+"]}
     cases = {}
     for sign, (shift, lower, upper, on_top) in laws.items():
         middle = feedforward + shift
-        clearance = {"high": space.poly(upper - middle) - linear, "low": space.poly(lower + middle) + linear}
+        clearance = {
+            "high": space.poly(upper - middle + apart) - linear,
+            "low": space.poly(lower + middle + apart) + linear,
+        }
         occurs = [
             case
-            for case, left in (("high", upper - middle), ("low", lower + middle))
-            if not (left > 0 and is_positive(space.poly(left * left) - bound_squared, {0: (low, high)}, depth=4))
+            for case, left in (("high", upper - middle - apart), ("low", lower + middle - apart))
+            if not (left > 0 and is_positive(space.poly(left * left) - feedback.squared, {0: (low, high)}, depth=4))
         ]
-        law = space.poly(middle + on_top) + linear
+        law = space.poly(middle + on_top) + linear + feedback.offset
         cases[f"free{sign}"] = Case([clearance[case] for case in occurs], law, False)
         ends = {"high": upper + on_top, "low": on_top - lower}
         for case in occurs:
-            cases[case + sign] = Case([clearance[case] * Q(-1)], space.poly(ends[case]), True)
+            reached = space.poly(2 * apart) - clearance[case]
+            cases[case + sign] = Case([reached], space.poly(ends[case]), True)
     return cases

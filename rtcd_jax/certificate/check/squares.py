@@ -7,8 +7,8 @@ from functools import lru_cache
 from itertools import combinations_with_replacement
 from typing import Any, NamedTuple
 
-from rtcd_jax.certificate.check.exact import Q, require, rounded
-from rtcd_jax.certificate.check.taylor import peak, polynomial, terms_of
+from rtcd_jax.certificate.check.exact import Q, require, rounded, up
+from rtcd_jax.certificate.check.taylor import chebyshev, peak, polynomial, terms_of
 
 
 class Obligation(NamedTuple):
@@ -63,7 +63,7 @@ def reduced(exponents: tuple[int, ...]) -> tuple[tuple[tuple[int, ...], int], ..
 
 
 @lru_cache(1000)
-def _basis_change(order: int, degree: int, low, high) -> tuple:
+def basis_change(order: int, degree: int, low, high) -> tuple:
     """Row k: s^k in the Bernstein polynomials of `degree` on [low, high]."""
     rows, width = [], high - low
     for k in range(order + 1):
@@ -78,7 +78,7 @@ def bernstein(p, degree: int, low, high, place: str) -> list[dict]:
     terms = terms_of(p)
     order = max((e[0] for e, _ in terms), default=0)
     require(order <= degree, place, f"order {order} in time needs more than {degree + 1} Bernstein polynomials")
-    rows, parts = _basis_change(order, degree, low, high), [{} for _ in range(degree + 1)]
+    rows, parts = basis_change(order, degree, low, high), [{} for _ in range(degree + 1)]
     for e, c in terms:
         for f, k in reduced(e[1:]):
             for part, weight in zip(parts, rows[e[0]], strict=True):
@@ -185,13 +185,29 @@ def is_positive(p, box: Mapping[int, tuple[Any, Any]], depth: int = 10) -> bool:
 
 def _in_bernstein(terms: Mapping[tuple[int, ...], Any], i: int, degree: int, low, high) -> dict:
     """The coefficients with the powers of the variable i replaced by Bernstein polynomials of a degree."""
-    rows, total = _basis_change(degree, degree, low, high), {}
+    rows, total = basis_change(degree, degree, low, high), {}
     for e, c in terms.items():
         for j, weight in enumerate(rows[e[i]]):
             if weight != 0:
                 place = (*e[:i], j, *e[i + 1 :])
                 total[place] = total.get(place, 0) + c * weight
     return total
+
+
+def economized(p, n: int, degree: int) -> tuple[Any, Any]:
+    """A polynomial of at most this degree in each of the robot's numbers, and a bound of what that changes."""
+    terms, error = dict(terms_of(p)), Q(0)
+    others = len(next(iter(terms), (0,) * (n + 1))) - 1
+    for i in range(n + 1, others + 1):
+        for k in range(max(e[i] for e in terms), degree, -1):
+            for e in [e for e in terms if e[i] == k]:
+                c = terms.pop(e) / 2 ** (k - 1)
+                error += abs(c) * peak(e[1 : n + 1])
+                for j, t in enumerate(chebyshev(k)[:k]):
+                    if t:
+                        lower = (*e[:i], j, *e[i + 1 :])
+                        terms[lower] = terms.get(lower, Q(0)) - c * t
+    return polynomial(others, terms), up(error)
 
 
 def control_points(p, n: int) -> dict[str, Any]:

@@ -102,9 +102,9 @@ class Taylor:
 
     def tidy(self) -> "Taylor":
         """The same function without terms of high order in s and y, its coefficients rounded."""
-        terms, r, d, n = {}, self.r, self.d, self.space.n
+        terms, r, d, n, stride = {}, self.r, self.d, self.space.n, self.space.stride
         for e, c in terms_of(self.p):
-            order = sum(e[1 : n + 1])
+            order = sum(e[1 : n + 1]) + (stride * sum(e[n + 1 :]) if stride else 0)
             if e[0] > self.space.s_order or order > self.space.y_order:
                 coefficient, error = Q(0), abs(c)
             else:
@@ -134,13 +134,14 @@ class Taylor:
 
 class Space(NamedTuple):
     """Where Taylor models live: n components of y, the orders in s and y above which terms go to the remainder, and m
-    uncertain numbers p of the robot, whose powers all stay.
+    uncertain numbers p of the robot. Each power of p counts as `stride` powers of y; with 0 all powers of p stay.
     """
 
     n: int
     s_order: int
     y_order: int
     m: int = 0
+    stride: int = 0
 
     def exponents(self, s: int = 0, y: int | None = None, p: int | None = None) -> tuple[int, ...]:
         """Of s^s, times the component y, times the component p."""
@@ -174,6 +175,10 @@ class Space(NamedTuple):
             total = total * inner + self.poly(c)
         return total
 
+    def of_the_robot(self, powers: Sequence[int]):
+        """The product of these powers of p."""
+        return self.polynomial({(0,) * (self.n + 1) + tuple(powers): Q(1)})
+
     @property
     def s(self):
         return self.polynomial({self.exponents(1): Q(1)})
@@ -194,17 +199,17 @@ def economize(series: Sequence, radius, degree: int):
     for k in range(len(c) - 1, degree, -1):
         if c[k] != 0:
             scale = c[k] * radius**k / Q(2 ** (k - 1))
-            c = [a - scale * t / radius**j for j, (a, t) in enumerate(zip(c[: k + 1], _chebyshev(k), strict=True))]
+            c = [a - scale * t / radius**j for j, (a, t) in enumerate(zip(c[: k + 1], chebyshev(k), strict=True))]
             error += abs(scale)
     return c[: degree + 1], error
 
 
 @lru_cache(None)
-def _chebyshev(k: int) -> tuple[int, ...]:
+def chebyshev(k: int) -> tuple[int, ...]:
     """Coefficients of T_k."""
     if k < 2:
         return (1,) if k == 0 else (0, 1)
-    twice, before = (0, *_chebyshev(k - 1)), (*_chebyshev(k - 2), 0, 0)
+    twice, before = (0, *chebyshev(k - 1)), (*chebyshev(k - 2), 0, 0)
     return tuple(2 * a - b for a, b in zip(twice, before, strict=True))
 
 

@@ -212,15 +212,17 @@ def sentence(report: Report) -> str:
         if claim.moves_the_goal
         else f"converges to within {max(report.rest):.1g} of the goal in every state"
     )
+    on = "at the center of its robot's funnel" if claim.shifts else "on the nominal motion"
     push = (
-        f" A state on the nominal motion that an impulse of up to {float(claim.push):.6g} {robot.input_unit} s on the "
+        f" A state {on} that an impulse of up to {float(claim.push):.6g} {robot.input_unit} s on the "
         f"motor hits, once and at any instant of [{report.start:.6g} s, {report.end:.6g} s], stays in the funnel."
         if claim.push
         else ""
     )
+    funnel = "the funnel of its robot, all of one size, each about its own center," if claim.shifts else "the funnel"
     return (
         f"PROVED in continuous time, by exact arithmetic, for {_robots(claim)} under the claimed controller, whose "
-        f"input never exceeds {limit}{_acts(claim)}: every motion that is in the funnel at some time of "
+        f"input never exceeds {limit}{_acts(claim)}: every motion that is in {funnel} at some time of "
         f"[{report.start:.6g} s, {report.end:.6g} s] stays in it, is in the goal region at {report.end:.6g} s, never "
         f"leaves that region, and "
         f"{comes}; {bounds or 'there is no limit on a state'} all the while.{push} Half widths: {extent('inlet')}; "
@@ -257,7 +259,7 @@ def _robots(claim: Claim) -> str:
     name, numbers = claim.robot.name, ", ".join(texts)
     if not claim.uncertain:
         return f"the model {name!r} ({numbers}; SI units)"
-    in_time = "constant" if claim.first_order else "constant or varying"
+    in_time = "constant" if claim.constant else "constant or varying"
     return f"every robot {name!r} with {numbers} (SI units; {in_time} in time)"
 
 

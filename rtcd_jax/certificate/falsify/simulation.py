@@ -110,6 +110,7 @@ class Motions:
         self._noise, self._age = _floats(claim.noise), beyond * float(claim.age)
         self.rest = float(check.read_goal(Node("goal", content["goal"]), claim).rest)
         self._x, self._rates, self._u, self._gains = map(_floats, (claim.x, claim.rates, claim.u, claim.K))
+        self._shifts = [(shift.powers, _floats(shift.x), _floats(shift.rates)) for shift in claim.shifts]
         self._goal, self._goal_gain = _floats(claim.x_goal), _floats(claim.K_goal)
         self._bounds = np.array([np.inf if b is None else float(b) for b in claim.bounds])
         self._outward = np.linalg.inv(_floats(Node("goal.axes", content["goal"]["axes"]).array(self.n, self.n)))
@@ -151,7 +152,8 @@ class Motions:
             before, after = np.searchsorted(places, (place, place + 1))
             fraction = random.uniform(interval.start, interval.end)
             x[:, before:after] = (
-                self.nominal(interval.knot, fraction)[:, None] + interval.axes(fraction) @ y[:, before:after]
+                self.centers(interval.knot, fraction, drawn.part(slice(before, after)))
+                + interval.axes(fraction) @ y[:, before:after]
             )
             flight.again[:] = np.where(np.arange(0, count, REPEATED) >= before, x[:, ::REPEATED], flight.again)
             self._through(interval, interval.start, flight, slice(0, before), steps)
@@ -174,14 +176,13 @@ class Motions:
             if (steps_held := int(self._age / step)) and i % steps_held == 0:
                 held, held_again = (law.feedback(t, each) for each in (x, flight.again[:, again]))
             inward = np.linalg.inv(interval.axes(fraction))
-            acting = Acting(
-                drawn, self._signs(law, t, x, inward, self.nominal(interval.knot, fraction), drawn, flight), held
-            )
+            center = self.centers(interval.knot, fraction, drawn)
+            acting = Acting(drawn, self._signs(law, t, x, inward, center, drawn, flight), held)
             flight.x[:, who] = self.advanced(law, t, step, x, 1, acting)
             acting = acting.part(twice)._replace(held=held_again)
             flight.again[:, again] = self.advanced(law, t, step, flight.again[:, again], 2, acting)
             inward = np.linalg.inv(interval.axes(ahead))
-            flight.measure(self.nominal(interval.knot, ahead), inward, who, again)
+            flight.measure(self.centers(interval.knot, ahead, drawn), inward, who, again)
 
     def _settle(self, flight: "_Flight", steps: int) -> tuple[np.ndarray, np.ndarray]:
         """Whether every motion arrives, and the largest growth of |y| in one step."""
@@ -194,7 +195,7 @@ class Motions:
             for i in range(round(TOGETHER / step)):
                 if (steps_held := int(self._age / step)) and i % steps_held == 0:
                     held = law.feedback(0.0, x)
-                signs = self._signs(law, 0.0, x, self._outward, self._goal, drawn, flight)
+                signs = self._signs(law, 0.0, x, self._outward, self._goal[:, None], drawn, flight)
                 x = self.advanced(law, i * step, step, x, 1, Acting(drawn, signs, held))
                 now = self.goal_level(x)
                 grown = np.where(level > near, now - level, 0) if self.rest else now - level
@@ -214,7 +215,21 @@ class Motions:
 
     def nominal(self, k: int, t: float) -> np.ndarray:
         """x* at a fraction of an interval: the cubic Hermite interpolant."""
-        a, b, va, vb = self._x[k], self._x[k + 1], self._rates[k][0] * self.dt, self._rates[k][1] * self.dt
+        return self._cubics(self._x, self._rates, k, t)
+
+    def centers(self, k: int, t: float, drawn: Drawn) -> np.ndarray:
+        """c_p [n M], or x* [n 1], at a fraction of an interval."""
+        center = self.nominal(k, t)[:, None]
+        for powers, x, rates in self._shifts:
+            factor = 1.0
+            for name, power in zip(self.claim.uncertain, powers, strict=True):
+                low, high = map(float, self.claim.parameters[name])
+                factor = factor * ((2 * drawn.numbers[name] - low - high) / (high - low)) ** power
+            center = center + self._cubics(x, rates, k, t)[:, None] * factor
+        return center
+
+    def _cubics(self, x: np.ndarray, rates: np.ndarray, k: int, t: float) -> np.ndarray:
+        a, b, va, vb = x[k], x[k + 1], rates[k][0] * self.dt, rates[k][1] * self.dt
         return a + t * (va + t * (3 * (b - a) - 2 * va - vb + t * (2 * (a - b) + va + vb)))
 
     def tracking(self, k: int) -> Law:
@@ -241,7 +256,7 @@ class Motions:
             return np.ones(x.shape[1])
         u = np.zeros(x.shape[1])
         pushed = rate(self.claim.robot, drawn, x, u + 1) - rate(self.claim.robot, drawn, x, u)
-        greedy = np.sum((inward @ (x - center[:, None])) * (inward @ pushed), axis=0)
+        greedy = np.sum((inward @ (x - center)) * (inward @ pushed), axis=0)
         return np.where(
             drawn.greedy > 0, np.where(greedy >= 0, 1.0, -1.0), flight.random.choice([-1.0, 1.0], x.shape[1])
         )
@@ -286,8 +301,9 @@ class _Flight:
 
     def measure(self, center: np.ndarray, inward: np.ndarray, who: slice, again: slice) -> None:
         """|y| at an instant of the funnel; `inward` is L^-1."""
-        level = np.linalg.norm(inward @ (self.x[:, who] - center[:, None]), axis=0)
-        finer = np.linalg.norm(inward @ (self.again[:, again] - center[:, None]), axis=0)
+        level = np.linalg.norm(inward @ (self.x[:, who] - center), axis=0)
+        its_own = center if center.shape[1] == 1 else center[:, -who.start % REPEATED :: REPEATED]
+        finer = np.linalg.norm(inward @ (self.again[:, again] - its_own), axis=0)
         self.level[who] = np.maximum(self.level[who], level)
         self.measure_limits(self.x[:, who], who)
         if finer.size:

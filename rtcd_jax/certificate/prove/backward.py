@@ -43,13 +43,19 @@ MULTIPLIER = 1
 class Tier(NamedTuple):
     """Orders in s and y of Taylor models, the degree of the squares' monomials, and whether they have further ones.
 
-    u_lin has order 4 in s (K times L), so that all fit into Bernstein polynomials of the order in s.
+    u_lin has order 4 in s (K times L), so that all fit into Bernstein polynomials of the order in s. About own motions
+    a power of a robot's number counts as `stride` powers of y.
     """
 
     time_order: int
     order: int
     degree: int
     further: bool = False
+    stride: int = 1
+
+    def orders(self, claim: Claim, degree: int = 1) -> tuple[int, ...]:
+        """An interval's; `degree` is that in each of the robot's numbers."""
+        return (self.time_order, self.order, *((self.stride, degree) if claim.shifts else ()))
 
     def shapes(self, todo: dict[str, Obligation], loop: Loop, fewest: int) -> dict[str, list[Shape]]:
         """Of the programs of each case, the cheapest first: of every degree from `fewest` on, then the tier's own."""
@@ -70,8 +76,20 @@ TIERS = {
     4: (Tier(5, 3, 2), Tier(5, 5, 3), Tier(7, 8, 3, True)),
 }
 """By the number of states, the cheapest first."""
+TIERS_OF_OWN_MOTIONS = {
+    2: (Tier(5, 5, 3), Tier(5, 7, 4), Tier(5, 9, 5, stride=2), Tier(5, 11, 6, stride=2)),
+    4: (Tier(5, 5, 3), Tier(5, 6, 3, True), Tier(7, 8, 3, True, 2)),
+}
+"""As `TIERS`."""
+DEGREES = (1, 2, 3)
+"""In each of a robot's numbers about own motions, the cheapest first: 2, 3 or 4 control points for each."""
 ERROR_FRACTION = 1 / 3
 """A Taylor model is good enough if its error is at most this fraction of the decay margin."""
+
+
+def tiers_of(claim: Claim) -> tuple[Tier, ...]:
+    """The cheapest first."""
+    return (TIERS_OF_OWN_MOTIONS if claim.shifts else TIERS)[claim.n]
 
 
 class Proved(NamedTuple):
@@ -182,7 +200,8 @@ class BackwardProof:
         fractions = check.rational(start), check.rational(end)
         late = loop.late_rows(k, start, end) if self.claim.first_order else []
         sides = loop.sides(k, start, end)
-        return Interval(k, *fractions, on_grid(a), state.axes, bend, TIERS[self.claim.n][0][:2], {}, late, sides), rho
+        orders = tiers_of(self.claim)[0].orders(self.claim)
+        return Interval(k, *fractions, on_grid(a), state.axes, bend, orders, {}, late, sides), rho
 
     def _models(
         self, interval: Interval, decay_margin: float
@@ -190,11 +209,15 @@ class BackwardProof:
         """The interval's obligations by the cheapest Taylor models that are good enough, or the richest, and the shapes
         of their programs.
         """
-        for tier in TIERS[self.claim.n]:
-            interval = interval._replace(orders=(tier.time_order, tier.order))
-            todo = check.funnel_obligations(self.claim, interval, "interval")
-            if max(float(each.error) for each in todo.values()) <= ERROR_FRACTION * decay_margin:
-                break
+        for tier in tiers_of(self.claim):
+            interval = interval._replace(orders=tier.orders(self.claim))
+            models = check.funnel_models(self.claim, interval, "interval")
+            for degree in DEGREES if self.claim.shifts else (None,):
+                todo = check.obligations_of(self.claim, models, degree)
+                if degree is not None:
+                    interval = interval._replace(orders=tier.orders(self.claim, degree))
+                if max(float(each.error) for each in todo.values()) <= ERROR_FRACTION * decay_margin:
+                    return interval, todo, tier.shapes(todo, self.loop, FEWEST)
         return interval, todo, tier.shapes(todo, self.loop, FEWEST)
 
 

@@ -290,7 +290,7 @@ def _interval_record(interval: check.Interval) -> dict[str, Any]:
 def _goal_record(region: GoalRegion) -> dict[str, Any]:
     """The weight of the S-lemma lies between those that the two scaled copies of one ellipsoid allow."""
     determinant = float(np.linalg.det(np.array([[float(c) for c in row] for row in region.axes])))
-    weight = determinant**2 * (1 + region.outlet / region.rho) / 2
+    weight = determinant**2 * (1 + region.outlet / region.rho - region.off**2) / 2
     shells = [
         with_digests({"start": double(s.start), "end": double(s.end), "cases": _cases_record(s.cases)})
         for s in region.shells

@@ -2,14 +2,14 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from copy import copy
-from functools import lru_cache
-from math import comb
-from typing import Any, NamedTuple, cast, final
+from typing import Any, cast, final
 
 import numpy as np
 from scipy.optimize import brentq
 
 from rtcd_jax.certificate import check
+from rtcd_jax.certificate.prove.centers import Corners, fitted, shifts_at
+from rtcd_jax.certificate.prove.field import ControlPoints, linear, rate
 from rtcd_jax.certificate.prove.robot import ClaimedRobot, claimed_robot
 from rtcd_jax.certificate.prove.uncertainty import Bounds, bounds_of
 from rtcd_jax.config.schema import UncertaintyConfig
@@ -53,6 +53,7 @@ def claim_of(elite: Elite, bounds: Bounds | None = None) -> dict[str, Any]:
     """
     robot = claimed_robot(elite)
     bounds = bounds or bounds_of(elite, UncertaintyConfig())
+    loop = _loop_record(elite, robot)
     claim = {
         "robot": robot_record(robot.description),
         "parameters": {name: doubles(bounds.parameters[name]) for name in robot.numbers},
@@ -61,7 +62,8 @@ def claim_of(elite: Elite, bounds: Bounds | None = None) -> dict[str, Any]:
         "noise": doubles(bounds.noise),
         "age": double(bounds.age),
         "speed": double(0.0),
-        **_loop_record(elite, robot),
+        **loop,
+        **({"shifts": _shifts_record(robot, bounds, loop)} if bounds.moving else {}),
         **({"keep_out": [_set_record(each) for each in elite.keep_out]} if elite.keep_out else {}),
     }
     rest = {"start": [0, double(0.0)], "push": double(0.0)}
@@ -100,6 +102,16 @@ def _loop_record(elite: Elite, robot: ClaimedRobot) -> dict[str, Any]:
     }
 
 
+def _shifts_record(robot: ClaimedRobot, bounds: Bounds, loop: dict[str, Any]) -> list[dict[str, Any]]:
+    def numbers(key: str) -> np.ndarray:
+        return np.vectorize(float.fromhex)(loop[key])
+
+    parameters = {name: bounds.parameters[name] for name in robot.numbers}
+    motion = numbers("x"), numbers("rates"), numbers("u"), numbers("K")
+    parts = fitted(robot.description, parameters, float.fromhex(loop["dt"]), motion, sum(bounds.limit) / 2)
+    return [with_digests({**part, "x": doubles(part["x"]), "rates": doubles(part["rates"])}) for part in parts]
+
+
 def robot_record(robot: check.Robot) -> dict[str, Any]:
     """A robot as certificates write it."""
 
@@ -122,93 +134,6 @@ def robot_record(robot: check.Robot) -> dict[str, Any]:
     }
     names = {"name": robot.name, "states": list(robot.states), "units": list(robot.units)}
     return with_digests({**names, "input_unit": robot.input_unit, "joints": list(robot.joints), **functions})
-
-
-@lru_cache
-def float_equations(robot: check.Robot) -> check.Equations:
-    """A robot's equations with float coefficients."""
-
-    def function(terms: Any) -> Any:
-        return tuple(term._replace(cosine=float(term.cosine), sine=float(term.sine)) for term in terms)
-
-    exact = check.derive(robot)
-    return exact._replace(
-        robot=robot._replace(
-            mass=tuple(tuple(function(entry) for entry in row) for row in robot.mass),
-            damping=tuple(map(function, robot.damping)),
-            motor=tuple(map(function, robot.motor)),
-        ),
-        slopes=tuple(map(function, exact.slopes)),
-        christoffel=tuple({pair: function(terms) for pair, terms in row.items()} for row in exact.christoffel),
-    )
-
-
-def field(robot: check.Robot, numbers: Mapping[str, Any], x: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """D [...], a [n ...] and b [n ...] at states x [n ...], real or complex; numbers may be arrays."""
-    equations = float_equations(robot)
-    angles = {k: sum(a * q for a, q in zip(k, x, strict=False) if a) for k in equations.waves}
-    waves = {k: (np.sin(angle), np.cos(angle)) for k, angle in angles.items()}
-    determinant, a, b = equations.field(numbers, x, waves)
-    shape = np.broadcast_shapes(*map(np.shape, (determinant, *a, *b)))
-    whole = [np.broadcast_to(each, shape) for each in (determinant, *a, *b)]
-    return whole[0], np.stack(whole[1 : len(x) + 1]), np.stack(whole[len(x) + 1 :])
-
-
-def rate(robot: check.Robot, numbers: Mapping[str, Any], x: np.ndarray, u: Any) -> np.ndarray:
-    """x' [n ...] of states [n ...], real or complex."""
-    determinant, drift, push = field(robot, numbers, x)
-    return (drift + push * u) / determinant
-
-
-def linear(robot: check.Robot, numbers: Mapping[str, Any], x: np.ndarray, u: float) -> tuple[np.ndarray, np.ndarray]:
-    """A [n n] and B [n] at x [n], by complex steps."""
-    step = 1e-30
-    a = np.imag(rate(robot, numbers, x[:, None] + 1j * step * np.eye(len(x)), u)) / step
-    return a, np.imag(rate(robot, numbers, x.astype(complex), u + 1j * step)) / step
-
-
-class ControlPoints(NamedTuple):
-    """The field's Bernstein control points over the robots: mixtures [J, nodes] of its values at robots of the box.
-
-    `numbers` are these robots' [nodes 1].
-    """
-
-    numbers: dict[str, np.ndarray]
-    mixtures: np.ndarray
-
-    @classmethod
-    def of(cls, claim: check.Claim) -> "ControlPoints":
-        """With the degrees of the exact field at some state."""
-        space, n = claim.space(0, 0), claim.n
-        states = [check.Q(2 * i + 3, 7) for i in range(n)]
-        waves = {k: (check.Q(3, 5 + i), check.Q(4, 7 + i)) for i, k in enumerate(claim.equations.waves)}
-        determinant, a, b = claim.equations.field(claim.numbers(space), states, waves)
-        exponents = [e for each in (determinant, *a, *b) for e, _ in check.terms_of(space.enclose(each).p)]
-        degrees = [max(e[n + 1 + i] for e in exponents) for i in range(space.m)]
-        axes = {name: np.array([float(low)]) for name, (low, _) in claim.parameters.items()}
-        mixtures = np.eye(1)
-        for name, degree in zip(claim.uncertain, degrees, strict=True):
-            low, high = map(float, claim.parameters[name])
-            at = np.linspace(0, 1, degree + 1)
-            axes[name] = low + (high - low) * at
-            values = np.array(
-                [[comb(degree, j) * t**j * (1 - t) ** (degree - j) for j in range(degree + 1)] for t in at]
-            )
-            mixtures = np.kron(mixtures, np.linalg.inv(values))
-        grid = np.meshgrid(*(axes[name] for name in claim.uncertain), indexing="ij")
-        spread = {name: each.reshape(-1, 1) for name, each in zip(claim.uncertain, grid, strict=True)}
-        return cls({name: spread.get(name, value[:, None]) for name, value in axes.items()}, mixtures)
-
-    def field(self, robot: check.Robot, x: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """D [J D], a [n J D] and b [n J D] at states x [n D]."""
-        return tuple(  # pyright: ignore[reportReturnType]
-            np.einsum(
-                "jk,...kd->...jd",
-                self.mixtures,
-                np.broadcast_to(each, (*each.shape[:-2], len(self.mixtures), x.shape[1])),
-            )
-            for each in field(robot, self.numbers, x[:, None])
-        )
 
 
 @final
@@ -234,7 +159,12 @@ class Loop:
             ]
             late_at_goal = check.lateness(claim, late_at_goal, check.rational(misfit_at_goal), check.Q(0))
         self.late, self.late_at_goal = [float(each) for each in late], float(late_at_goal)
-        self._points = ControlPoints.of(claim)
+        self._points = self._robots = ControlPoints.of(claim)
+        self._shifts = np.zeros((len(claim.x), self.n, 1)), np.zeros((len(claim.u), 2, self.n, 1))
+        if claim.shifts:
+            corners = Corners.of({name: (float(low), float(high)) for name, (low, high) in claim.parameters.items()})
+            self._robots = ControlPoints(corners.numbers, np.eye(len(corners.points)))
+            self._shifts = shifts_at(claim.shifts, corners.points)
         self.x, self.rates, self.u = floats(claim.x), floats(claim.rates), floats(claim.u)
         self.gains, self.goal, self.goal_gain = floats(claim.K), floats(claim.x_goal), floats(claim.K_goal)
         self.bounds = np.array([np.inf if b is None else float(b) for b in claim.bounds])
@@ -274,6 +204,11 @@ class Loop:
         """x* and x*' at a fraction of the interval k."""
         return hermite(fraction, self.dt, self.x[k], self.rates[k, 0], self.x[k + 1], self.rates[k, 1])
 
+    def shift(self, k: int, fraction: float) -> tuple[np.ndarray, np.ndarray]:
+        """c_p - x* and its rate [n J] of the robots at the corners, the first of which is the nominal one."""
+        x, rates = self._shifts
+        return hermite(fraction, self.dt, x[k], rates[k, 0], x[k + 1], rates[k, 1])
+
     def error_rate(self, k: int, fraction: float) -> Callable[[np.ndarray], np.ndarray]:
         """Errors e [n D] from the nominal motion -> e' = f(x* + e, u) - x*' [n D], at a fraction of the interval k."""
         center, center_rate = self.nominal(k, fraction)
@@ -312,41 +247,48 @@ class Loop:
         return 2 * self.rise(k, fraction, *self.axes(k, fraction, rho, 0.0), directions)
 
     def rise(self, k: int, fraction: float, axes: np.ndarray, axes_rate: np.ndarray, directions: np.ndarray) -> float:
-        """The largest |y|' over |y| = 1, where x = x* + L y, of all robots and inputs; searched from the sampled
+        """The largest |y|' over |y| = 1, where x = c_p + L y, of all robots and inputs; searched from the sampled
         directions [n D].
         """
-        center, center_rate = self.nominal(k, fraction)
+        (center, center_rate), (shift, shift_rate) = self.nominal(k, fraction), self.shift(k, fraction)
         gain = (1 - fraction) * self.gains[k] + fraction * self.gains[k + 1]
         inverse = np.linalg.inv(axes)
 
         def rises(y: np.ndarray) -> np.ndarray:
-            error, weight = axes @ y, inverse.T @ y
-            asked = self.u[k] - gain @ error
-            oldest = asked + self.age * self.late_row(k, fraction) @ error if self.claim.first_order else asked
-            worst = self._fastest(center[:, None] + error, weight, (asked, oldest), self.late[k])
-            return worst - center_rate @ weight - np.sum(weight * (axes_rate @ y), axis=0)
+            weight = inverse.T @ y
+            error = shift[:, :, None] + (axes @ y)[:, None]
+            asked = self.u[k] - np.tensordot(gain, error, 1)
+            late = self.age * np.tensordot(self.late_row(k, fraction), error, 1) if self.claim.first_order else 0
+            x = center[:, None, None] + error
+            rises = self._fastest(self._robots, x, weight, (asked, asked + late), self.late[k]) - shift_rate.T @ weight
+            return np.max(rises, axis=0) - center_rate @ weight - np.sum(weight * (axes_rate @ y), axis=0)
 
         return _highest(rises, directions)
 
     def _fastest(
-        self, x: np.ndarray, weight: np.ndarray, asked: tuple[np.ndarray, np.ndarray], late: float
+        self,
+        points: ControlPoints,
+        x: np.ndarray,
+        weight: np.ndarray,
+        asked: tuple[np.ndarray, np.ndarray],
+        late: float,
     ) -> np.ndarray:
-        """The largest weight'x' [D] of the robots' control points and of inputs from one asked to another; x [n D]."""
-        determinant, a, b = self._points.field(self.robot, x)
+        """The largest weight'x' [J D] of the robots, of inputs from one asked to another; x [n D] or [n J D]."""
+        determinant, a, b = points.field(self.robot, x)
         free, forced = (np.einsum("nd,njd->jd", weight, each) / determinant for each in (a, b))
         (weak, strong), w = self.limits, self.disturbance
         least, most = np.minimum(*asked) - late, np.maximum(*asked) + late
         low, high = np.clip(least, -strong, weak) - w, np.clip(most, -weak, strong) + w
-        return np.max(free + np.maximum(forced * low, forced * high), axis=0)
+        return free + np.maximum(forced * low, forced * high)
 
     def drift(self, k: int, fraction: float, axes: np.ndarray, y: np.ndarray) -> np.ndarray:
         """y'L^-1 (f(x* + L y, u) - x*') [D] for directions y [n D] of an ellipsoid L."""
         return np.sum(y * np.linalg.solve(axes, self.error_rate(k, fraction)(axes @ y)), axis=0)
 
     def clearance(self, k: int, fraction: float) -> np.ndarray:
-        """The half widths [n] that the limits on the states allow an ellipsoid."""
-        center, _ = self.nominal(k, fraction)
-        return self.bounds - np.abs(center)
+        """The half widths [n] that the limits on the states allow an ellipsoid about any of the centers."""
+        center, shift = self.nominal(k, fraction)[0], self.shift(k, fraction)[0]
+        return self.bounds - np.max(np.abs(center[:, None] + shift), axis=1)
 
     def box_level(self, k: int, fraction: float) -> float:
         """The level of the ellipsoid that touches a limit on the states or a set to keep out of.
@@ -355,7 +297,8 @@ class Loop:
             Refused: x* is in such a set.
         """
         s, _ = self.value(k, fraction)
-        return self._clear(_touching(self.clearance(k, fraction), s), self.nominal(k, fraction)[0], s)
+        level = _touching(self.clearance(k, fraction), s)
+        return self._clear(level, self.nominal(k, fraction)[0], s, self.shift(k, fraction)[0])
 
     def sides(self, k: int, start: float, end: float) -> list[list]:
         """Of every ellipsoid to keep out of, the normals [2 n] of half spaces that hold it, at both ends of a part of
@@ -372,8 +315,16 @@ class Loop:
     def _ellipsoids(self) -> list[Ellipsoid]:
         return [each for each in self.keep_out if isinstance(each, Ellipsoid)]
 
-    def _clear(self, level: float, center: np.ndarray, s: np.ndarray) -> float:
-        return min([level, *(_touched(each, center, s)[0] for each in self.keep_out)])
+    def _clear(self, level: float, center: np.ndarray, s: np.ndarray, shift: np.ndarray | None = None) -> float:
+        for each in self.keep_out:
+            touching, normal = _touched(each, center, s)
+            if shift is not None and self.claim.shifts:  # the sets' sides are those of the nominal motion
+                reach = np.sqrt(normal @ np.linalg.solve(s, normal))
+                room = np.sqrt(touching) * reach - np.max(normal @ shift)
+                check.require(bool(room > 0), "the motion", "of a robot enters a set to keep out of")
+                touching = float((room / reach) ** 2)
+            level = min(level, touching)
+        return level
 
     def goal_box_level(self) -> float:
         """As `box_level`; half a turn away is another equilibrium, which no goal region has in it."""
@@ -391,7 +342,9 @@ class Loop:
             error = axes @ y
             asked = -self.goal_gain @ error
             oldest = asked + self.age * row @ error if self.claim.first_order else asked
-            return 2 * self._fastest(self.goal[:, None] + error, s @ error, (asked, oldest), self.late_at_goal) / rho
+            x = self.goal[:, None] + error
+            rises = self._fastest(self._points, x, s @ error, (asked, oldest), self.late_at_goal)
+            return 2 * np.max(rises, axis=0) / rho
 
         return _highest(rises, directions)
 

@@ -7,7 +7,7 @@ import numpy as np
 from rtcd_jax.certificate import check
 from rtcd_jax.certificate.check import Claim, Refused, Shell
 from rtcd_jax.certificate.prove.backward import Tier, prove
-from rtcd_jax.certificate.prove.closed_loop import Loop, on_grid
+from rtcd_jax.certificate.prove.closed_loop import Loop, floats, on_grid
 from rtcd_jax.certificate.prove.levels import goal_level, unit_directions
 from rtcd_jax.certificate.prove.sdp import SOLVER
 
@@ -26,10 +26,14 @@ NARROWEST = 1 / 64
 
 
 class GoalRegion(NamedTuple):
-    """{V <= rho} as proved, shell by shell from |y| = `rest` on; the funnel's outlet has the level `outlet`."""
+    """{V <= rho} as proved, shell by shell from |y| = `rest` on; the funnel's outlet has the level `outlet`.
+
+    `off` is the largest |y| of a center at t_N.
+    """
 
     rho: float
     outlet: float
+    off: float
     axes: list
     order: int
     rest: float
@@ -97,5 +101,14 @@ def _at_level(
                 return None, error
     except Refused:
         return None, error
-    outlet, sides = (1 - OUTLET_CLEARANCE) * rho, loop.goal_sides()
-    return GoalRegion(rho, outlet, axes, tier.order, rest, shells[::-1], least, late, sides), error
+    off = largest_offset(claim, axes) if claim.shifts else 0.0
+    if off >= 1:
+        return None, error
+    outlet, sides = (1 - off) ** 2 * (1 - OUTLET_CLEARANCE) * rho, loop.goal_sides()
+    return GoalRegion(rho, outlet, off, axes, tier.order, rest, shells[::-1], least, late, sides), error
+
+
+def largest_offset(claim: Claim, axes: list) -> float:
+    """The largest |y| in the goal region of a center at t_N."""
+    centers = floats(check.last_centers(claim)) - floats(claim.x_goal)
+    return float(np.max(np.linalg.norm(np.linalg.solve(floats(axes), centers.T), axis=0)))

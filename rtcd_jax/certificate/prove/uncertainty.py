@@ -16,7 +16,8 @@ NONE = "none"
 class Bounds(NamedTuple):
     """Least and largest values of the numbers and of the motor's limit; the rest as a claim has it.
 
-    `rest` is the largest |y| of the goal region below which motions may stay.
+    `rest` is the largest |y| of the goal region below which motions may stay. `moving`: the numbers are constant, and
+    each robot's funnel is about its own motion.
     """
 
     parameters: dict[str, tuple[float, float]]
@@ -25,6 +26,7 @@ class Bounds(NamedTuple):
     noise: list[float]
     age: float
     rest: float
+    moving: bool = False
 
 
 def bounds_of(elite: Elite, uncertainty: UncertaintyConfig) -> Bounds:
@@ -47,6 +49,7 @@ def bounds_of(elite: Elite, uncertainty: UncertaintyConfig) -> Bounds:
         list(uncertainty.noise) or [0.0] * n,
         uncertainty.age,
         uncertainty.residual,
+        uncertainty.center == "moving" and any(widths.values()),
     )
 
 

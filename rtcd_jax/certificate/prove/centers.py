@@ -1,0 +1,95 @@
+"""Centers that move with a robot's constant numbers: polynomials in these, fitted to the robots' own motions."""
+
+import itertools
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from rtcd_jax.certificate import check
+from rtcd_jax.certificate.prove.field import rate
+from rtcd_jax.numerics.hermite import cubic_hermite
+
+STEPS = 8
+"""Of Runge-Kutta, an interval, for own motions."""
+DEGREE = 2
+"""Of the centers in the robots' numbers."""
+
+
+class Corners(NamedTuple):
+    """Robots of a box: points p [J m] of {-1, 0, 1}^m, the first 0, and their numbers [J 1]."""
+
+    points: Float[np.ndarray, "J m"]
+    numbers: dict[str, Float[np.ndarray, "J 1"]]
+
+    @classmethod
+    def of(cls, parameters: dict[str, tuple[float, float]]) -> "Corners":
+        """Of least and largest values by name; those that differ are uncertain."""
+        uncertain = sorted(name for name, (low, high) in parameters.items() if low < high)
+        points = np.array(sorted(itertools.product((-1.0, 0.0, 1.0), repeat=len(uncertain)), key=np.any))
+        numbers = {}
+        for name, (low, high) in parameters.items():
+            place = points[:, uncertain.index(name)] if name in uncertain else np.zeros(len(points))
+            numbers[name] = ((low + high) / 2 + (high - low) / 2 * place)[:, None]
+        return cls(points, numbers)
+
+
+def fitted(
+    robot: check.Robot,
+    parameters: dict[str, tuple[float, float]],
+    dt: float,
+    motion: tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray],
+    limit: float,
+) -> list[dict[str, Any]]:
+    """`powers` by name, `x` [N+1 n] and `rates` [N 2 n] of every part of the centers, by least squares.
+
+    Robots of the box make their own motions from x*(0) by u = clip(u*_k - K(t) (x - x*(t)), +-limit); `motion` has x*
+    and its rates as a claim has them, u* and K.
+    """
+    x, rates, u, gains = motion
+    corners = Corners.of(parameters)
+    uncertain = sorted(name for name, (low, high) in parameters.items() if low < high)
+    away, slopes = np.zeros((len(corners.points), *x.shape)), np.zeros((len(corners.points), *rates.shape))
+    now = np.repeat(x[0][:, None], len(corners.points), axis=1)
+    for k in range(len(u)):
+        ends = dt, x[k], rates[k, 0], x[k + 1], rates[k, 1]
+
+        def moving(fraction: float, state: np.ndarray, k: int = k, ends: tuple = ends) -> np.ndarray:
+            gain = (1 - fraction) * gains[k] + fraction * gains[k + 1]
+            error = state - cubic_hermite(fraction, *ends)[:, None]
+            asked = np.clip(u[k] - gain @ error, -limit, limit)
+            return rate(robot, corners.numbers, state[:, :, None], asked[:, None])[:, :, 0]
+
+        slopes[:, k, 0] = (moving(0.0, now) - rates[k, 0][:, None]).T
+        step = 1 / STEPS
+        for i in range(STEPS):
+            at = i * step
+            a = moving(at, now)
+            b = moving(at + step / 2, now + dt * step / 2 * a)
+            c = moving(at + step / 2, now + dt * step / 2 * b)
+            d = moving(at + step, now + dt * step * c)
+            now = now + dt * step / 6 * (a + 2 * (b + c) + d)
+        slopes[:, k, 1] = (moving(1.0, now) - rates[k, 1][:, None]).T
+        away[:, k + 1] = (now - x[k + 1][:, None]).T
+    powers = [e for e in itertools.product(range(DEGREE + 1), repeat=len(uncertain)) if 0 < sum(e) <= DEGREE]
+    terms = np.stack([np.prod(corners.points ** np.array(e), axis=1) for e in powers], axis=1)
+    inverse = np.linalg.pinv(terms)
+    parts = zip(powers, *(np.tensordot(inverse, each, 1) for each in (away, slopes)), strict=True)
+    return [
+        {"powers": {name: e for name, e in zip(uncertain, each, strict=True) if e}, "x": values, "rates": turns}
+        for each, values, turns in parts
+    ]
+
+
+def shifts_at(shifts: Sequence[check.Shift], points: Float[np.ndarray, "J m"]) -> tuple[np.ndarray, np.ndarray]:
+    """c_p - x* at the knots [N+1 n J] and its rates at both ends of the intervals [N 2 n J], of points p."""
+    x = rates = np.zeros(1)
+    for powers, values, turns in shifts:
+        factor = np.prod(points ** np.array(powers), axis=1)
+        x, rates = x + _floats(values)[..., None] * factor, rates + _floats(turns)[..., None] * factor
+    return x, rates
+
+
+def _floats(values: Any) -> np.ndarray:
+    return np.array(values, dtype=object).astype(float)
