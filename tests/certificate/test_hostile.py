@@ -146,7 +146,7 @@ def test_too_large_a_file_is_undecided(asked, tmp_path, capsys):
 
 def test_polynomials_too_large_to_multiply_are_refused(content, asked):
     node = check.Node("funnel[0].orders", [15, 15])
-    with pytest.raises(check.Refused, match="asks for polynomials of 62016 terms, must be at most 6000"):
+    with pytest.raises(check.Refused, match="asks for polynomials of 62016 terms, must be at most 10000"):
         check.file.require_few_terms(node, 4, 15, 15)
     check.file.require_few_terms(node, 4, 7, 8)  # the cart-pole's intervals
 

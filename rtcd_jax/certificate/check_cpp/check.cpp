@@ -55,7 +55,7 @@ using Matrix = vector<Row>;
 
 constexpr int BITS = 128;             // of the fixed point in which enclosures count; every rounding is added to a bound
 constexpr long MAX_BYTES = 1L << 28;  // of a file
-constexpr int MAX_ORDER = 16, MAX_TERMS = 6000, MAX_NOTES = 20, LONGEST_NAME = 40, LONGEST_NOTE = 79;
+constexpr int MAX_ORDER = 16, MAX_TERMS = 10000, MAX_NOTES = 20, LONGEST_NAME = 40, LONGEST_NOTE = 79;
 constexpr int MOST_JOINTS = 4, MOST_TERMS_OF_ROBOT = 200, HIGHEST = 8, MOST_UNCERTAIN = 6, MOST_GRAMS = 32;
 constexpr size_t MOST_FURTHER = 32;
 constexpr int MAX_DEPTH = 100;                   // of lists and objects; a certificate has a dozen
