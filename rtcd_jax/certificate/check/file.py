@@ -366,7 +366,7 @@ def read_interval(node: Node, claim: Claim) -> Interval:
     )
     node.require_digests()
     n = claim.n
-    pair = [order.integer(1, MAX_ORDER - 1) for order in orders.items(4 if claim.shifts else 2)]
+    pair = [order.integer(1, MAX_ORDER - 1) for order in orders.items(3 + len(claim.uncertain) if claim.shifts else 2)]
     of_robots = (len(claim.uncertain), pair[2]) if claim.shifts else (0, 1)
     require_few_terms(orders, n, pair[0], pair[1], of_robots)
     interval = Interval(

@@ -1,6 +1,6 @@
 """The obligations of one interval of the funnel: d/dt |y|^2 < 0 on |y| = 1, for every robot and case of the input."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 from rtcd_jax.certificate.check.claim import Claim
@@ -54,7 +54,7 @@ class Interval(NamedTuple):
     """One interval of the funnel: L(s) between its ends is linear plus (1 - s^2) (bend_0 + bend_1 s).
 
     `orders` are those of its Taylor models in s and y; about own motions also how many powers of y one of a robot's
-    number counts for, and the degree in each of them that stays.
+    numbers counts as, and by number the degree that stays in the end.
     """
 
     knot: int
@@ -106,16 +106,16 @@ def motion(claim: Claim, interval: Interval) -> Motion:
 
 def funnel_obligations(claim: Claim, interval: Interval, place: str) -> dict[str, Obligation]:
     """By case of the input and, behind a slash, control point of the robots."""
-    return obligations_of(claim, funnel_models(claim, interval, place), *interval.orders[3:])
+    return obligations_of(claim, funnel_models(claim, interval, place), interval.orders[3:])
 
 
 def obligations_of(
-    claim: Claim, models: Mapping[str, tuple[Case, Taylor]], degree: int | None = None
+    claim: Claim, models: Mapping[str, tuple[Case, Taylor]], degrees: Sequence[int]
 ) -> dict[str, Obligation]:
-    """As `funnel_obligations`; polynomials are of at most this `degree` in each of the robot's numbers."""
+    """As `funnel_obligations`; polynomials are of at most these degrees in the robot's numbers, if there are any."""
     obligations = {}
     for name, (case, q) in models.items():
-        p, changed = (q.p, Q(0)) if degree is None else economized(q.p, claim.n, degree)
+        p, changed = economized(q.p, claim.n, degrees) if degrees else (q.p, Q(0))
         obligations |= for_all_robots(name, case, p, q.r + q.d + changed, Q(0), WHOLE[0], claim)
     return obligations
 

@@ -194,11 +194,11 @@ def _in_bernstein(terms: Mapping[tuple[int, ...], Any], i: int, degree: int, low
     return total
 
 
-def economized(p, n: int, degree: int) -> tuple[Any, Any]:
-    """A polynomial of at most this degree in each of the robot's numbers, and a bound of what that changes."""
+def economized(p, n: int, degrees: Sequence[int]) -> tuple[Any, Any]:
+    """A polynomial of at most these degrees in the robot's numbers, and a bound of what that changes."""
     terms, error = dict(terms_of(p)), Q(0)
     others = len(next(iter(terms), (0,) * (n + 1))) - 1
-    for i in range(n + 1, others + 1):
+    for i, degree in zip(range(n + 1, others + 1), degrees, strict=False):
         for k in range(max(e[i] for e in terms), degree, -1):
             for e in [e for e in terms if e[i] == k]:
                 c = terms.pop(e) / 2 ** (k - 1)

@@ -57,7 +57,8 @@ constexpr int BITS = 128;             // of the fixed point in which enclosures 
 constexpr long MAX_BYTES = 1L << 28;  // of a file
 constexpr int MAX_ORDER = 16, MAX_TERMS = 10000, MAX_NOTES = 20, LONGEST_NAME = 40, LONGEST_NOTE = 79;
 constexpr int MOST_JOINTS = 4, MOST_TERMS_OF_ROBOT = 200, HIGHEST = 8, MOST_UNCERTAIN = 6, MOST_GRAMS = 32;
-constexpr size_t MOST_FURTHER = 32;
+constexpr size_t MOST_FURTHER = 32, MOST_SHIFTS = 20;
+constexpr int HIGHEST_SHIFT = 3;
 constexpr int MAX_DEPTH = 100;                   // of lists and objects; a certificate has a dozen
 constexpr double MOST_COEFFICIENTS = 4e6;        // of a polynomial in Bernstein form: some 200 MB
 constexpr long MOST_TURNS = 1000000;             // largest angle [rad] of a goal
@@ -624,7 +625,8 @@ std::pair<vector<vector<T>>, T> cofactors(const vector<vector<T>>& m, const T& o
 //
 // A Model is a polynomial p in (s, y_1 .. y_n, p_1 .. p_m), in fixed point of 2^-BITS, and two bounds in the same unit:
 // the function is within d + r |s| of p wherever |s|, |y|, |p_i| <= 1. At the goal s is the level l, so that r counts
-// what vanishes with it. Terms of higher order in s or y than the space's go to the bounds; powers of p stay.
+// what vanishes with it. Terms of higher order in s or y than the space's go to the bounds; powers of p stay, or count
+// as `stride` powers of y each.
 
 using Key = unsigned __int128;  // exponents, one byte a variable: s first
 
@@ -638,7 +640,7 @@ inline int exponent(Key k, int variable) { return int(k >> (8 * variable)) & 255
 inline Key power(int variable, int e = 1) { return Key(e) << (8 * variable); }
 
 struct Space {
-  int n, m, s_order, y_order;
+  int n, m, s_order, y_order, stride = 0;
 
   int others() const { return n + m; }
   Key y_part(Key k) const { return k >> 8 & ((Key(1) << (8 * n)) - 1); }
@@ -646,6 +648,17 @@ struct Space {
     int total = 0;
     for (int i = 1; i <= n; i++) total += exponent(k, i);
     return total;
+  }
+  bool has(Key k) const {  // whether it is within the orders
+    int total = y_degree(k);
+    if (stride)
+      for (int i = n + 1; i <= n + m; i++) total += stride * exponent(k, i);
+    return exponent(k, 0) <= s_order && total <= y_order;
+  }
+  Key robot(const vector<int>& powers) const {
+    Key key = 0;
+    for (size_t i = 0; i < powers.size(); i++) key += power(1 + n + int(i), powers[i]);
+    return key;
   }
 };
 
@@ -725,7 +738,7 @@ struct Model {
     Model out(*space);
     out.r = r, out.d = d;
     for (auto& t : p) {
-      if (exponent(t.key, 0) > space->s_order || space->y_degree(t.key) > space->y_order)
+      if (!space->has(t.key))
         out.count(t.key, shifted_up(abs(t.c) * peak(space->y_part(t.key))));
       else
         out.p.push_back(t);
@@ -829,7 +842,7 @@ Model operator*(const Model& a, const Model& b) {
   Z lost[2] = {0, 0};  // by whether they vanish with s, in 2^-3 BITS
   for (auto& t : sums.terms) {
     Key key = t.key;
-    if (exponent(key, 0) > space.s_order || space.y_degree(key) > space.y_order) {
+    if (!space.has(key)) {
       lost[exponent(key, 0) > 0] += abs(t.c) * peak(space.y_part(key));
       continue;
     }
@@ -1108,12 +1121,13 @@ Field<T> field(const Robot& robot, const std::map<string, Q>& exact, const std::
                : sine == 0 ? found->second.second * cosine
                            : found->second.second * cosine + found->second.first * sine;
       Q factor = 1;
+      std::optional<T> among;  // the uncertain ones' product
       for (auto& [name, e] : powers)
         for (int i = 0; i < e; i++) {
           if (auto given = exact.find(name); given != exact.end()) factor *= given->second;
-          else part = part * uncertain.at(name);
+          else among = among ? *among * uncertain.at(name) : uncertain.at(name);
         }
-      part = part * factor;
+      part = among ? part * (*among * factor) : part * factor;
       for (size_t i = 0; i < n; i++)
         if (!robot.hinge[i])
           for (int e = 0; e < joints[i]; e++) part = part * x[i];
@@ -1528,6 +1542,13 @@ struct KeptOut {
   }
 };
 
+// A part of c_p - x*: a product of powers of p, by the uncertain numbers, times cubics by their values and rates.
+struct Shift {
+  vector<int> powers;
+  Matrix x;
+  vector<Matrix> rates;
+};
+
 struct Claim {
   Robot robot;
   vector<std::pair<string, std::pair<Q, Q>>> parameters;  // in the file's order
@@ -1542,7 +1563,9 @@ struct Claim {
   long first_knot = 0;
   vector<string> uncertain;
   vector<KeptOut> keep_out;
+  vector<Shift> shifts;
 
+  bool constant() const { return first_order || !shifts.empty(); }  // whether the numbers do not vary in time
   size_t ellipsoids() const {
     return size_t(std::count_if(keep_out.begin(), keep_out.end(), [](const KeptOut& each) { return !each.half; }));
   }
@@ -1550,7 +1573,7 @@ struct Claim {
   bool moves_the_goal() const {
     return disturbance != 0 || age != 0 || std::any_of(noise.begin(), noise.end(), [](const Q& e) { return e != 0; });
   }
-  Space space(int s_order, int y_order) const { return {int(n()), int(uncertain.size()), s_order, y_order}; }
+  Space space(int s_order, int y_order, int stride = 0) const { return {int(n()), int(uncertain.size()), s_order, y_order, stride}; }
 
   std::map<string, Q> exact() const {
     std::map<string, Q> out;
@@ -1679,9 +1702,10 @@ struct Case {
 template <class T>
 using Named = vector<std::pair<string, T>>;  // in the order in which they are decided
 
-// u_lin = feedforward + linear, |linear|^2 <= square on the sphere. `late` marks the law of the oldest measurement.
+// u_lin = feedforward + linear + what is the robot's own and at most `apart`; |linear|^2 <= square on the sphere. A
+// condition holds where it does for one robot. `late` marks the law of the oldest measurement.
 void add_cases(Named<Case>& cases, const Claim& claim, const Q& error, const Q& feedforward, const Curve& square,
-               const Q& low, const Q& high, bool late) {
+               const Q& low, const Q& high, bool late, const Q& apart = 0) {
   auto& [weak, strong] = claim.limits;
   const Q& w = claim.disturbance;
   bool one_law = error == 0 && weak == strong && w == 0;
@@ -1698,11 +1722,11 @@ void add_cases(Named<Case>& cases, const Claim& claim, const Q& error, const Q& 
     free.input = {middle + on_top}, free.late = late;
     for (bool above : {true, false}) {
       Q room = above ? Q(ceiling - middle) : Q(floor + middle);
-      if (!occurs(room)) continue;
+      if (!occurs(room - apart)) continue;
       // free: room -+ linear >= 0; saturated: the opposite
-      free.where_constant.push_back({room}), free.where_sign.push_back(above ? -1 : 1);
+      free.where_constant.push_back({room + apart}), free.where_sign.push_back(above ? -1 : 1);
       Case at_limit;
-      at_limit.where_constant = {Curve{-room}}, at_limit.where_sign = {above ? 1 : -1};
+      at_limit.where_constant = {Curve{apart - room}}, at_limit.where_sign = {above ? 1 : -1};
       at_limit.input = {above ? Q(ceiling + on_top) : Q(on_top - floor)};
       at_limit.saturated = true, at_limit.late = late;
       at_limits.push_back({(above ? "high" : "low") + name, at_limit});
@@ -1712,11 +1736,44 @@ void add_cases(Named<Case>& cases, const Claim& claim, const Q& error, const Q& 
   }
 }
 
-// The obligations of a case at every control point of the robots' numbers.
-void for_all_robots(Named<Obligation>& todo, const Claim& claim, const string& name, const Obligation& shared, const Model& p) {
+// Replaces powers above the `degrees` of a robot's numbers by lower ones, T_k being at most 1; returns what that changes.
+Q economize(std::map<Key, Q>& terms, const Space& space, const vector<int>& degrees) {
+  Q changed = 0;
+  for (int v = space.n + 1; v <= space.n + space.m; v++) {
+    int most = 0;
+    for (auto& [key, c] : terms) most = std::max(most, exponent(key, v));
+    for (int k = most; k > degrees[size_t(v - space.n - 1)]; k--) {
+      vector<long> before{1}, chebyshev{0, 1};
+      for (int order = 2; order <= k; order++) {
+        vector<long> after(size_t(order) + 1);
+        for (size_t i = 0; i < chebyshev.size(); i++) after[i + 1] += 2 * chebyshev[i];
+        for (size_t i = 0; i < before.size(); i++) after[i] -= before[i];
+        before = chebyshev, chebyshev = after;
+      }
+      std::map<Key, Q> kept;
+      for (auto& [key, c] : terms) {
+        if (exponent(key, v) != k) {
+          kept[key] += c;
+          continue;
+        }
+        Q scaled = c / Q(Z(1) << (k - 1));
+        changed += abs(scaled) * exactly(peak(space.y_part(key)));
+        for (int j = 0; j < k; j++)
+          if (chebyshev[size_t(j)]) kept[key - power(v, k) + power(v, j)] -= scaled * Q(chebyshev[size_t(j)]);
+      }
+      terms = kept;
+    }
+  }
+  return changed;
+}
+
+// The obligations of a case at every control point of the robots' numbers, each up to its degree if these are given.
+void for_all_robots(Named<Obligation>& todo, const Claim& claim, const string& name, Obligation shared, const Model& p,
+                    const vector<int>& kept = {}) {
   int n = int(claim.n()), m = int(claim.uncertain.size());
   std::map<Key, Q> terms;
   for (auto& t : p.p) terms[t.key] = exactly(t.c);
+  if (!kept.empty()) shared.error += economize(terms, *p.space, kept);
   vector<int> degrees;
   for (int i = 0; i < m; i++) {
     int v = 1 + n + i, degree = 0;
@@ -1845,14 +1902,24 @@ struct Interval {
   long knot;
   Q start, end;
   Matrix first, last, bend[2], late;  // late: rho at both ends, linear in between
-  int orders[2];
+  vector<int> orders;  // in s and y; about own motions also the stride of the robot's numbers, and their degrees that stay
   vector<string> names;
   std::map<string, Gram> cases;
   vector<Matrix> sides;  // of every ellipsoid to keep out of: the normals of half spaces that hold it, at both ends
 };
 
+Space space_of(const Claim& claim, const Interval& piece) {
+  return claim.space(piece.orders[0], piece.orders[1], piece.orders.size() > 2 ? piece.orders[2] : 0);
+}
+
+struct Shifted {  // a part of c_p - x* and its rate, in s
+  vector<int> powers;
+  vector<Curve> state, rate;
+};
+
 struct Motion {  // on one interval, in s
   vector<Curve> state, rate, bend, gain, gain_rate;
+  vector<Shifted> shifts;
   vector<vector<Curve>> axes, axes_rate;
   Q input, duration;
 };
@@ -1867,10 +1934,19 @@ Motion motion(const Claim& claim, const Interval& piece) {
     return out;
   };
   Motion out;
+  auto cubic = [&](const Matrix& x, const vector<Matrix>& slopes, size_t i) {
+    const Q &a = x[k][i], &b = x[k + 1][i];
+    Q va = claim.dt * slopes[k][0][i], vb = claim.dt * slopes[k][1][i];
+    return at(Curve{a, va, 3 * (b - a) - 2 * va - vb, 2 * (a - b) + va + vb}, fraction);
+  };
+  for (auto& shift : claim.shifts) {
+    Shifted part{shift.powers, {}, {}};
+    for (size_t i = 0; i < n; i++) part.state.push_back(cubic(shift.x, shift.rates, i));
+    part.rate = rates(part.state);
+    out.shifts.push_back(part);
+  }
   for (size_t i = 0; i < n; i++) {
-    const Q &a = claim.x[k][i], &b = claim.x[k + 1][i];
-    Q va = claim.dt * claim.rates[k][0][i], vb = claim.dt * claim.rates[k][1][i];
-    out.state.push_back(at(Curve{a, va, 3 * (b - a) - 2 * va - vb, 2 * (a - b) + va + vb}, fraction));
+    out.state.push_back(cubic(claim.x, claim.rates, i));
     out.gain.push_back(at(Curve{claim.k[k][i], claim.k[k + 1][i] - claim.k[k][i]}, fraction));
     vector<Curve> row;
     for (size_t j = 0; j < n; j++) {
@@ -1885,13 +1961,52 @@ Motion motion(const Claim& claim, const Interval& piece) {
   return out;
 }
 
+// row (c_p - x*), a polynomial in s and the robot's numbers, times `sign`; or the row times its rate.
+Model along_shifts(const Space& space, const Motion& on, const vector<Curve>& row, const Q& sign = 1, bool rate = false) {
+  Model total(space);
+  for (auto& part : on.shifts) total = total + model(space, dot(row, rate ? part.rate : part.state) * sign, space.robot(part.powers));
+  return total;
+}
+
+vector<Curve> unit_row(size_t n, size_t i) {
+  vector<Curve> row(n, Curve{0});
+  row[i] = Curve{1};
+  return row;
+}
+
+// Adds c_p - x* to values about x*.
+vector<Model> with_shifts(const Space& space, const Motion& on, vector<Model> values, bool rate = false) {
+  for (size_t i = 0; i < values.size(); i++) values[i] = values[i] + along_shifts(space, on, unit_row(values.size(), i), 1, rate);
+  return values;
+}
+
+// Whether row x* + c_p's part, plus a curve, is positive for all robots, and its square above another curve.
+bool clears(const Claim& claim, const Motion& on, const vector<Curve>& row, const Curve& curve, const Curve& square) {
+  size_t m = claim.uncertain.size();
+  Exact left, most;
+  auto add = [&](Exact& to, const Curve& c, const vector<int>& powers) {
+    for (size_t i = 0; i < c.size(); i++) {
+      vector<int> e{int(i)};
+      e.insert(e.end(), powers.begin(), powers.end());
+      to[e] += c[i];
+    }
+  };
+  vector<int> none(m, 0);
+  add(left, curve + dot(row, on.state), none);
+  for (auto& part : on.shifts) add(left, dot(row, part.state), part.powers);
+  add(most, square * Q(-1), none);
+  vector<std::pair<Q, Q>> box(1 + m, {Q(-1), Q(1)});
+  return is_positive(left, box) && is_positive(left * left + most, box);
+}
+
 // |x_i| <= bound in the ellipsoids.
 void require_bounds(const Claim& claim, const Motion& on, const string& place) {
   for (size_t i = 0; i < claim.n(); i++) {
     if (!claim.bounds[i]) continue;
     for (int sign : {1, -1}) {
-      Curve left = Curve{*claim.bounds[i]} + on.state[i] * Q(sign);
-      bool inside = is_positive(left) && is_positive(left * left - dot(on.axes[i], on.axes[i]));
+      vector<Curve> row = unit_row(claim.n(), i);
+      row[i] = row[i] * Q(sign);
+      bool inside = clears(claim, on, row, Curve{*claim.bounds[i]}, dot(on.axes[i], on.axes[i]));
       require(inside, place, "the limit |" + printable(claim.robot.states[i]) + "| <= " +
                                  formatted("%.6g", rounded(*claim.bounds[i])) + " " + printable(claim.robot.units[i]) + " is not kept");
     }
@@ -1905,14 +2020,15 @@ void require_kept_out(const Claim& claim, const Interval& piece, const Motion& o
     const KeptOut& each = claim.keep_out[j];
     Matrix ends = each.half ? Matrix{each.normal, each.normal} : piece.sides[ellipsoid++];
     Curve left{each.half ? each.offset : Q(-std::max(each.support(ends[0]), each.support(ends[1])))};
-    vector<Curve> w, turned(n, Curve{0});
+    vector<Curve> w, away, turned(n, Curve{0});
     for (size_t i = 0; i < n; i++) {
       w.push_back({(ends[0][i] + ends[1][i]) / 2, (ends[1][i] - ends[0][i]) / 2});
-      left = left + w[i] * (Curve{each.half ? Q(0) : each.center[i]} - on.state[i]);
+      away.push_back(w[i] * Q(-1));
+      left = left + w[i] * Curve{each.half ? Q(0) : each.center[i]};
     }
     for (size_t column = 0; column < n; column++)
       for (size_t i = 0; i < n; i++) turned[column] = turned[column] + w[i] * on.axes[i][column];
-    bool outside = is_positive(left) && is_positive(left * left - dot(turned, turned));
+    bool outside = clears(claim, on, away, left, dot(turned, turned));
     require(outside, place, "the set claim.keep_out[" + std::to_string(j) + "] is not kept out of");
   }
 }
@@ -1935,10 +2051,10 @@ vector<Model> tidied(const vector<Model>& models) {
   return out;
 }
 
-// x* + (b / D) J in the ellipsoid for |J| <= push: (D det L)^2 > |push adj(L) b|^2.
+// x* + (b / D) J, or c_p + (b / D) J, in the ellipsoid for |J| <= push: (D det L)^2 > |push adj(L) b|^2.
 void require_push(const Claim& claim, const Interval& piece, const Motion& on, const string& place) {
-  Space space = claim.space(piece.orders[0], piece.orders[1]);
-  vector<Model> x = tidied(models(space, on.state));
+  Space space = space_of(claim, piece);
+  vector<Model> x = tidied(with_shifts(space, on, models(space, on.state)));
   Here here(claim, space, x, waves_near(claim, x, place), place);
   auto [adjugate, determinant] = cofactors(on.axes, Curve{1});
   Model room = here.f.d * model(space, determinant), needed(space);
@@ -1964,14 +2080,20 @@ void require_push(const Claim& claim, const Interval& piece, const Motion& on, c
 void require_jump(const Claim& claim, const Interval& piece, const string& place) {
   size_t n = claim.n(), k = size_t(piece.knot);
   if (piece.start != 0 || k == 0) return;
-  Space space = claim.space(piece.orders[0], piece.orders[1]);
+  Space space = space_of(claim, piece);
   vector<vector<Curve>> axes(n);
   vector<Curve> center;
+  Motion here_on;
+  for (auto& shift : claim.shifts) {
+    Shifted part{shift.powers, {}, {}};
+    for (size_t i = 0; i < n; i++) part.state.push_back({shift.x[k][i]});
+    here_on.shifts.push_back(part);
+  }
   for (size_t i = 0; i < n; i++) {
     for (auto& c : piece.first[i]) axes[i].push_back({c});
     center.push_back({claim.x[k][i]});
   }
-  vector<Model> error = tidied(errors_of(space, axes)), x = states_of(space, center, error);
+  vector<Model> error = tidied(with_shifts(space, here_on, errors_of(space, axes))), x = states_of(space, center, error);
   Here here(claim, space, x, waves_near(claim, x, place), place);
   Q scale = scale_of(here.f.d), step = claim.u[k] - claim.u[k - 1];
   Model d = here.f.d * scale, moved(space), turned(space);
@@ -2009,12 +2131,12 @@ Q positive_scale(const Q& d, const Q& determinant, const string& place) {
 
 // What is to be shown on an interval, by case.
 Named<Obligation> funnel_obligations(const Claim& claim, const Interval& piece, const Motion& on, const string& place) {
-  Space space = claim.space(piece.orders[0], piece.orders[1]), wide = space;
+  Space space = space_of(claim, piece), wide = space;
   wide.y_order++;
   size_t n = claim.n();
   auto [adjugate, determinant] = cofactors(on.axes, Curve{1});
   require(is_positive(determinant), place, "an ellipsoid is degenerate: det L must be > 0");
-  vector<Model> error = errors_of(space, on.axes), x = states_of(space, on.state, error);
+  vector<Model> error = with_shifts(space, on, errors_of(space, on.axes)), x = states_of(space, on.state, error);
   Here here(claim, space, x, waves_near(claim, x, place), place);
   const Field<Model>& f = here.f;
   vector<Model> gain = models(space, on.gain);
@@ -2029,7 +2151,8 @@ Named<Obligation> funnel_obligations(const Claim& claim, const Interval& piece, 
   vector<Model> push, relative;
   for (auto& column : transposed(adjugate)) push.push_back(form(wide, column) * scale);
   for (size_t i = 0; i < n; i++) {
-    Model drag = (model(space, on.rate[i]) + form(space, on.axes_rate[i])).tidy();
+    Model own = along_shifts(space, on, unit_row(n, i), 1, true);
+    Model drag = (model(space, on.rate[i]) + own + form(space, on.axes_rate[i])).tidy();
     relative.push_back((f.a[i] - f.d * drag).in(wide));
   }
   vector<Model> b;
@@ -2044,6 +2167,7 @@ Named<Obligation> funnel_obligations(const Claim& claim, const Interval& piece, 
   vector<Curve> asked;  // the coefficients of -K L y
   for (auto& c : by_axes(on.gain)) asked.push_back(c * Q(-1));
   vector<Curve> asked_then;
+  Model own = along_shifts(wide, on, on.gain, -1), own_then(wide);  // of the feedback, what is the robot's
   Q late = claim.error_on(piece.knot);
   if (claim.first_order) {
     vector<Curve> row, older;
@@ -2061,16 +2185,19 @@ Named<Obligation> funnel_obligations(const Claim& claim, const Interval& piece, 
       for (long j = claim.oldest(piece.knot) + 1; j <= piece.knot; j++) jumps += claim.jumps[size_t(j)];
     late = lateness(claim, late, bounds.misfit, jumps);
     asked_then = by_axes(older);
+    own_then = along_shifts(wide, on, older);
   }
 
   Named<Case> cases;
-  add_cases(cases, claim, late, on.input, dot(asked, asked), -1, 1, false);
-  if (claim.first_order) add_cases(cases, claim, late, on.input, dot(asked_then, asked_then), -1, 1, true);
+  add_cases(cases, claim, late, on.input, dot(asked, asked), -1, 1, false, own.largest());
+  if (claim.first_order) add_cases(cases, claim, late, on.input, dot(asked_then, asked_then), -1, 1, true, own_then.largest());
   Named<Obligation> todo;
+  vector<int> kept;
+  if (!claim.shifts.empty()) kept.assign(piece.orders.begin() + 3, piece.orders.end());
   for (auto& [name, one] : cases) {
     const vector<Curve>& linear = one.late ? asked_then : asked;
     Model input = model(wide, one.input);
-    if (!one.saturated) input = input + form(wide, linear);
+    if (!one.saturated) input = input + form(wide, linear) + (one.late ? own_then : own);
     Model q = (free + forced * input) * Q(-1);
     Obligation shared{{}, exactly(q.r + q.d), 0, {}, -1, 1};
     for (size_t i = 0; i < one.where_constant.size(); i++) {
@@ -2080,7 +2207,7 @@ Named<Obligation> funnel_obligations(const Claim& claim, const Interval& piece, 
           if (linear[j][e] != 0) g.push_back({power(0, int(e)) + power(1 + int(j)), linear[j][e] * one.where_sign[i]});
       shared.where.push_back(g);
     }
-    for_all_robots(todo, claim, name, shared, q);
+    for_all_robots(todo, claim, name, shared, q, kept);
   }
   return todo;
 }
@@ -2197,13 +2324,39 @@ Named<Obligation> goal_obligations(const Claim& claim, const GoalField& field, c
   return todo;
 }
 
-// E(t_N) in G: |adj(L_g) (x_N - x_g + L_N y)| < det L_g for |y| <= 1, by the S-lemma with the file's weight.
-void require_arrival(const Claim& claim, const Matrix& outlet, const Goal& goal, const string& place) {
+// The Bernstein control points of c_p(t_N) over the robots: c_p(t_N) is a mean of them.
+vector<Row> last_centers(const Claim& claim) {
+  size_t m = claim.uncertain.size(), n = claim.n();
+  vector<int> degrees(claim.shifts.empty() ? 0 : m, 0), at(degrees.size(), 0);
+  for (auto& shift : claim.shifts)
+    for (size_t i = 0; i < m; i++) degrees[i] = std::max(degrees[i], shift.powers[i]);
+  vector<Row> centers;
+  std::function<void(size_t)> every = [&](size_t i) {
+    if (i < at.size()) {
+      for (at[i] = 0; at[i] <= degrees[i]; at[i]++) every(i + 1);
+      return;
+    }
+    Row center = claim.x.back();
+    for (auto& shift : claim.shifts) {
+      Q weight = 1;
+      for (size_t j = 0; j < m; j++)
+        weight *= bernstein_of_powers(degrees[j], degrees[j], -1, 1)[size_t(shift.powers[j])][size_t(at[j])];
+      for (size_t j = 0; j < n; j++) center[j] += weight * shift.x.back()[j];
+    }
+    centers.push_back(center);
+  };
+  every(0);
+  return centers;
+}
+
+// E(t_N) in G: |adj(L_g) (c - x_g + L_N y)| < det L_g for |y| <= 1, by the S-lemma with the file's weight; where that
+// holds for some centers c it does for their means.
+void require_arrival(const Claim& claim, const Matrix& outlet, const Goal& goal, const Row& center, const string& place) {
   size_t n = claim.n();
   auto [adjugate, determinant] = cofactors(goal.axes, Q(1));
   Matrix columns = transposed(outlet);
   columns.emplace_back();
-  for (size_t i = 0; i < n; i++) columns.back().push_back(claim.x.back()[i] - claim.x_goal[i]);
+  for (size_t i = 0; i < n; i++) columns.back().push_back(center[i] - claim.x_goal[i]);
   Matrix moved, form(n + 1, Row(n + 1));
   for (auto& column : columns) {
     moved.emplace_back();
@@ -2372,6 +2525,32 @@ vector<Matrix> read_sides(const Node& node, const Claim& claim, long ends) {
   return sides;
 }
 
+vector<Shift> read_shifts(const Node& node, const Claim& claim, long knots) {
+  vector<Shift> shifts;
+  long n = long(claim.robot.states.size());
+  std::set<vector<int>> known;
+  for (auto& each : node.items(-1, 1)) {
+    each.keys({"powers", "x", "rates"});
+    each.digests();
+    Shift shift;
+    std::map<string, int> by_name;
+    for (auto& [name, value] : each.at("powers").named()) by_name[name] = int(value.integer(1, HIGHEST_SHIFT));
+    bool holds = !by_name.empty();
+    for (auto& [name, e] : by_name) holds = holds && std::count(claim.uncertain.begin(), claim.uncertain.end(), name);
+    each.at("powers").require(holds, "must be of " + joined(claim.uncertain));
+    for (auto& name : claim.uncertain) shift.powers.push_back(by_name.count(name) ? by_name[name] : 0);
+    shift.x = each.at("x").matrix(knots, n);
+    bool still = std::all_of(shift.x[0].begin(), shift.x[0].end(), [](const Q& q) { return q == 0; });
+    each.at("x").items()[0].require(still, "must be zero: all robots begin about x*(0)");
+    for (auto& pair : each.at("rates").items(knots - 1)) shift.rates.push_back(pair.matrix(2, n));
+    known.insert(shift.powers);
+    shifts.push_back(shift);
+  }
+  node.require(shifts.size() <= MOST_SHIFTS, "has " + std::to_string(shifts.size()) + " entries, must have at most " + std::to_string(MOST_SHIFTS));
+  node.require(known.size() == shifts.size(), "has the same powers twice");
+  return shifts;
+}
+
 Claim read_claim_2(const Node& node) {
   vector<string> names{"robot", "parameters", "limit", "disturbance", "noise", "age", "speed"};
   names.insert(names.end(), LOOP.begin(), LOOP.end());
@@ -2380,6 +2559,7 @@ Claim read_claim_2(const Node& node) {
   claim.first_order = node.has("jerk");
   if (claim.first_order) names.insert(names.end(), {"jerk", "reaction", "jumps"});
   if (node.has("keep_out")) names.push_back("keep_out");
+  if (node.has("shifts")) names.push_back("shifts");
   node.keys(names);
   node.digests();
   claim.robot = read_robot(node.at("robot"));
@@ -2407,6 +2587,7 @@ Claim read_claim_2(const Node& node) {
   }
   if (node.has("keep_out"))
     for (auto& each : node.at("keep_out").items(-1, 1)) claim.keep_out.push_back(read_set(each, long(claim.robot.states.size())));
+  if (node.has("shifts")) claim.shifts = read_shifts(node.at("shifts"), claim, long(node.at("x").items().size()));
   read_loop(node, claim);
   return claim;
 }
@@ -2464,8 +2645,12 @@ void read_cases(const Node& node, int n, vector<string>& names, std::map<string,
   }
 }
 
-void require_few_terms(const Node& node, long n, long s_order, long y_order) {
-  Z terms = (s_order + 1) * binomial((unsigned long)(y_order + n), (unsigned long)n);
+// Each of m numbers of a robot counts as `stride` powers of y.
+void require_few_terms(const Node& node, long n, long s_order, long y_order, long m = 0, long stride = 1) {
+  Z terms = 0;
+  for (long k = 0; k <= (m ? y_order / stride : 0); k++)
+    terms += binomial((unsigned long)(k ? m + k - 1 : 0), (unsigned long)k) * binomial((unsigned long)(y_order - stride * k + n), (unsigned long)n);
+  terms *= s_order + 1;
   node.require(terms <= MAX_TERMS, "asks for polynomials of " + terms.get_str() + " terms, must be at most " + std::to_string(MAX_TERMS));
 }
 
@@ -2477,9 +2662,9 @@ Interval read_interval(const Node& node, const Claim& claim) {
   node.digests();
   long n = long(claim.n());
   Interval piece;
-  auto orders = node.at("orders").items(2);
-  for (int i : {0, 1}) piece.orders[i] = int(orders[size_t(i)].integer(1, MAX_ORDER - 1));
-  require_few_terms(node.at("orders"), n, piece.orders[0], piece.orders[1]);
+  for (auto& order : node.at("orders").items(claim.shifts.empty() ? 2 : 3 + long(claim.uncertain.size()))) piece.orders.push_back(int(order.integer(1, MAX_ORDER - 1)));
+  if (claim.shifts.empty()) require_few_terms(node.at("orders"), n, piece.orders[0], piece.orders[1]);
+  else require_few_terms(node.at("orders"), n, piece.orders[0], piece.orders[1], long(claim.uncertain.size()), piece.orders[2]);
   piece.knot = node.at("knot").integer(0, long(claim.u.size()) - 1);
   piece.start = node.at("start").number(), piece.end = node.at("end").number();
   piece.first = node.at("first").matrix(n, n), piece.last = node.at("last").matrix(n, n);
@@ -2631,7 +2816,7 @@ Report check(const Value& content) {
   }
   GoalField field;
   goal_field(claim, goal, at_goal, field);
-  require_arrival(claim, funnel.back().last, goal, at_goal + ".axes");
+  for (auto& center : last_centers(claim)) require_arrival(claim, funnel.back().last, goal, center, at_goal + ".axes");
   std::optional<Q> least;
   Q drift = 0;
   for (size_t i = 0; i < goal.shells.size(); i++) {
@@ -2708,7 +2893,7 @@ string sentence(const Report& report) {
   string robots = claim.uncertain.empty()
                       ? "the model " + quoted(printable(robot.name)) + " (" + numbers + "; SI units)"
                       : "every robot " + quoted(printable(robot.name)) + " with " + numbers + " (SI units; " +
-                            (claim.first_order ? "constant" : "constant or varying") + " in time)";
+                            (claim.constant() ? "constant" : "constant or varying") + " in time)";
   for (size_t i = 0; i < claim.n(); i++)
     if (claim.bounds[i])
       bounds += (bounds.empty() ? "" : " and ") + ("|" + printable(robot.states[i]) + "| <= " + number(*claim.bounds[i]) + " " + printable(robot.units[i]));
@@ -2737,13 +2922,14 @@ string sentence(const Report& report) {
                                        " of the goal in every state";
   string times = "[" + six(report.start) + " s, " + six(report.end) + " s]";
   if (claim.push != 0)
-    push = " A state on the nominal motion that an impulse of up to " + number(claim.push) + " " + input +
-           " s on the motor hits, once and at any instant of " + times + ", stays in the funnel.";
+    push = string(" A state ") + (claim.shifts.empty() ? "on the nominal motion" : "at the center of its robot's funnel") +
+           " that an impulse of up to " + number(claim.push) + " " + input + " s on the motor hits, once and at any instant of " + times + ", stays in the funnel.";
+  string funnel = claim.shifts.empty() ? "the funnel" : "the funnel of its robot, all of one size, each about its own center,";
   bool noisy = !errors.empty();
   string extents;
   for (const char* place : {"inlet", "outlet", "goal"}) extents += (extents.empty() ? "" : "; ") + (place + (" " + widths(report.widths.at(place))));
   return "PROVED in continuous time, by exact arithmetic, for " + robots + " under the claimed controller, whose input never exceeds " +
-         limit + acts + ": every motion that is in the funnel at some time of " + times + " stays in it, is in the goal region at " +
+         limit + acts + ": every motion that is in " + funnel + " at some time of " + times + " stays in it, is in the goal region at " +
          six(report.end) + " s, never leaves that region, and " + comes + "; " + (bounds.empty() ? "there is no limit on a state" : bounds) +
          " all the while." + push + " Half widths: " + extents + ". Volumes (proved) [" + unit + "]: inlet " + six(report.inlet) +
          ", sum over the knots " + six(report.sum) + ", integral over time " + six(report.integral) + " s, goal region " + six(report.goal) +

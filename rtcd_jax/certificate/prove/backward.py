@@ -6,6 +6,8 @@ only verifies. Where it fails, the decay margin is raised, then the interval hal
 more than it needs, the interval is proved once more with a lower decay margin.
 """
 
+import itertools
+import math
 from collections.abc import Iterator
 from functools import cache
 from typing import Any, NamedTuple, cast, final
@@ -53,9 +55,9 @@ class Tier(NamedTuple):
     further: bool = False
     stride: int = 1
 
-    def orders(self, claim: Claim, degree: int = 1) -> tuple[int, ...]:
-        """An interval's; `degree` is that in each of the robot's numbers."""
-        return (self.time_order, self.order, *((self.stride, degree) if claim.shifts else ()))
+    def orders(self, claim: Claim, degrees: tuple[int, ...]) -> tuple[int, ...]:
+        """An interval's; `degrees` are those in the robot's numbers."""
+        return (self.time_order, self.order, *((self.stride, *degrees) if claim.shifts else ()))
 
     def shapes(self, todo: dict[str, Obligation], loop: Loop, fewest: int) -> dict[str, list[Shape]]:
         """Of the programs of each case, the cheapest first: of every degree from `fewest` on, then the tier's own."""
@@ -81,8 +83,10 @@ TIERS_OF_OWN_MOTIONS = {
     4: (Tier(5, 5, 3), Tier(5, 6, 3, True), Tier(7, 8, 3, True, 2)),
 }
 """As `TIERS`."""
-DEGREES = (1, 2, 3)
-"""In each of a robot's numbers about own motions, the cheapest first: 2, 3 or 4 control points for each."""
+HIGHEST_DEGREE = 3
+"""In each of a robot's numbers about own motions: a number has one control point more."""
+ENOUGH_OF_DEGREES = 1.25
+"""Times the error of the models: higher degrees do not help then."""
 ERROR_FRACTION = 1 / 3
 """A Taylor model is good enough if its error is at most this fraction of the decay margin."""
 
@@ -90,6 +94,12 @@ ERROR_FRACTION = 1 / 3
 def tiers_of(claim: Claim) -> tuple[Tier, ...]:
     """The cheapest first."""
     return (TIERS_OF_OWN_MOTIONS if claim.shifts else TIERS)[claim.n]
+
+
+def degrees_of(claim: Claim) -> list[tuple[int, ...]]:
+    """In the robot's numbers about own motions, those with the fewest control points first; else nothing but ()."""
+    choices = itertools.product(range(1, HIGHEST_DEGREE + 1), repeat=len(claim.uncertain) if claim.shifts else 0)
+    return sorted(choices, key=lambda degrees: (math.prod(degree + 1 for degree in degrees), degrees))
 
 
 class Proved(NamedTuple):
@@ -200,7 +210,7 @@ class BackwardProof:
         fractions = check.rational(start), check.rational(end)
         late = loop.late_rows(k, start, end) if self.claim.first_order else []
         sides = loop.sides(k, start, end)
-        orders = tiers_of(self.claim)[0].orders(self.claim)
+        orders = tiers_of(self.claim)[0].orders(self.claim, degrees_of(self.claim)[0])
         return Interval(k, *fractions, on_grid(a), state.axes, bend, orders, {}, late, sides), rho
 
     def _models(
@@ -209,15 +219,18 @@ class BackwardProof:
         """The interval's obligations by the cheapest Taylor models that are good enough, or the richest, and the shapes
         of their programs.
         """
+        degrees, allowed = degrees_of(self.claim), ERROR_FRACTION * decay_margin
         for tier in tiers_of(self.claim):
-            interval = interval._replace(orders=tier.orders(self.claim))
+            interval = interval._replace(orders=tier.orders(self.claim, degrees[0]))
             models = check.funnel_models(self.claim, interval, "interval")
-            for degree in DEGREES if self.claim.shifts else (None,):
-                todo = check.obligations_of(self.claim, models, degree)
-                if degree is not None:
-                    interval = interval._replace(orders=tier.orders(self.claim, degree))
-                if max(float(each.error) for each in todo.values()) <= ERROR_FRACTION * decay_margin:
-                    return interval, todo, tier.shapes(todo, self.loop, FEWEST)
+            own = max(float(q.r + q.d) for _, q in models.values())
+            if own <= allowed:
+                break
+        for each in degrees:
+            interval = interval._replace(orders=tier.orders(self.claim, each))
+            todo = check.obligations_of(self.claim, models, each)
+            if max(float(each.error) for each in todo.values()) <= max(allowed, ENOUGH_OF_DEGREES * own):
+                break
         return interval, todo, tier.shapes(todo, self.loop, FEWEST)
 
 

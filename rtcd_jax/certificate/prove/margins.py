@@ -7,7 +7,7 @@ import numpy as np
 
 from rtcd_jax.certificate import check
 from rtcd_jax.certificate.check import Claim, Interval, Q
-from rtcd_jax.certificate.prove.backward import tiers_of
+from rtcd_jax.certificate.prove.backward import degrees_of, tiers_of
 from rtcd_jax.certificate.prove.closed_loop import Loop, doubles, on_grid
 from rtcd_jax.certificate.prove.levels import leveled, unit_directions
 from rtcd_jax.elite.elite import Elite
@@ -59,7 +59,7 @@ def feedback_delay(claim: Claim, elite: Elite) -> Delay:
         Refused: there are no such levels.
     """
     loop = leveled(Loop(claim._replace(age=Q(0), jerk=None), elite), unit_directions(claim.n))
-    orders, zero = tiers_of(claim)[0].orders(claim), np.zeros((claim.n, claim.n))
+    orders, zero = tiers_of(claim)[0].orders(claim, degrees_of(claim)[0]), np.zeros((claim.n, claim.n))
     bend = [on_grid(zero), on_grid(zero)]
     intervals = []
     for k in range(len(claim.u)):
