@@ -35,7 +35,9 @@ def _records(content):
     shells = goal.get("shells") if isinstance(goal, dict) else None
     lists = [each for each in (content.get("funnel"), shells) if isinstance(each, list)]
     robot = claim.get("robot") if isinstance(claim, dict) else None
-    for record in (robot, claim, *(record for each in lists for record in each), goal, content):
+    parts = claim.get("shifts") if isinstance(claim, dict) else None
+    lists.append(parts if isinstance(parts, list) else [])
+    for record in (robot, *lists.pop(), claim, *(record for each in lists for record in each), goal, content):
         if isinstance(record, dict):
             yield record
 

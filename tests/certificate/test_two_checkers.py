@@ -23,7 +23,7 @@ from tests.certificate.test_hostile import hostile_files, lines_are_the_checker_
 
 FILES = Path(__file__).parent / "files"
 KINDS = ("version1", "version2_age", "box", "age", "cartpole", "two_joints", "two_joints_box", "box_and_age",
-         "further")  # fmt: skip
+         "further", "own_motions")  # fmt: skip
 """Certificates of every kind of claim; all but the first two end with the last intervals of a test's elite."""
 
 
@@ -57,7 +57,7 @@ ULP = 2.0**-52
 FACTORS = (1 + ULP, 1 - ULP, 1 + 2.0**-30, 1 - 2.0**-30, 1.0001, 0.9999, 1.01, 0.99, 1.3, 0.7, 4.0, -1.0, 0.0)
 STATEMENT = {
     "parameters", "limit", "disturbance", "noise", "age", "speed", "jerk", "reaction", "jumps", "push", "robot",
-    "state_limits", "K_goal", "x_goal", "start",
+    "state_limits", "K_goal", "x_goal", "start", "shifts",
 }  # fmt: skip
 
 
@@ -155,7 +155,7 @@ def case_changed(content, dice):
     elif kind == 4 and "further" in cases[name]:
         dice.choice(cases[name]["further"])[dice.randrange(2)] += dice.choice([-1, 1])
     elif kind == 4 and "orders" in piece:
-        piece["orders"][dice.randrange(2)] += dice.choice([-1, 1])
+        piece["orders"][dice.randrange(len(piece["orders"]))] += dice.choice([-1, 1])
     else:
         matrices = cases[name][dice.choice(["gram", "multipliers"])]
         if matrices:

@@ -125,6 +125,7 @@ from rtcd_jax.certificate.check.squares import (
     Obligation,
     bernstein,
     control_points,
+    economized,
     is_positive,
     is_positive_definite,
     margin,
