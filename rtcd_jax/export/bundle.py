@@ -200,7 +200,7 @@ def read_bundle(
         model=model,
         joints=model.actuator_trnid[:, 0].copy(),
         standing=certificate,
-        proof=proof,
+        proof=proof and proof.of_all_robots(),
         control_rate=control_rate(stored, proof, lambda done, of: show(done, of, "trying control rates")),
         robustness=borne(folder, name),
     )

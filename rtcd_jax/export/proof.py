@@ -1,6 +1,6 @@
 """The funnel that an elite's certificate proves, as the exported monitors evaluate it."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, final
 
@@ -8,6 +8,8 @@ import numpy as np
 from jaxtyping import Float
 
 from rtcd_jax.certificate.check import Node, parse, read_claim, read_goal, read_interval
+from rtcd_jax.certificate.prove.margins import center_offset
+from rtcd_jax.system.errors import UserError
 
 
 @final
@@ -16,12 +18,15 @@ class ProvedFunnel:
     """E(t) = {x*(t) + L(t) y : |y| <= 1} of a certificate.
 
     Piece i begins at `begins`[i], in knots, and L = sum_j `axes`[i, j] s^j there, with s from -1 to 1 until the next
-    one begins. The last piece is the goal's region, for all time. `rates` are x*' at both ends of every interval.
+    one begins. The last piece is the goal's region, for all time. `rates` are x*' at both ends of every interval. Of a
+    certificate about own motions these are the nominal robot's ellipsoids, and `offsets` [pieces] bounds the |y| of
+    other robots' centers in them.
     """
 
     begins: Float[np.ndarray, " pieces"]
     axes: Float[np.ndarray, "pieces 4 n n"]
     rates: Float[np.ndarray, "intervals 2 n"]
+    offsets: Float[np.ndarray, " pieces"]
 
     @classmethod
     def read(cls, path: Path) -> "ProvedFunnel":
@@ -29,15 +34,30 @@ class ProvedFunnel:
         content = parse(path.read_bytes())
         claim = read_claim(Node("claim", content["claim"]))
         intervals = [read_interval(Node("funnel", interval), claim) for interval in content["funnel"]]
-        begins, axes = [], []
+        begins, axes, offsets = [], [], []
         for interval in intervals:
+            offsets.append(center_offset(claim, interval) if claim.shifts else 0.0)
             begins.append(float(interval.knot + interval.start))
             first, last, (bend_0, bend_1) = map(_floats, (interval.first, interval.last, interval.bend))
             axes.append([(first + last) / 2 + bend_0, (last - first) / 2 + bend_1, -bend_0, -bend_1])
         goal = _floats(read_goal(Node("goal", content["goal"]), claim).axes)
         begins.append(float(len(claim.u)))
         axes.append([goal, 0 * goal, 0 * goal, 0 * goal])
-        return cls(np.array(begins), np.array(axes), _floats(claim.rates))
+        return cls(np.array(begins), np.array(axes), _floats(claim.rates), np.array([*offsets, 0.0]))
+
+    def of_all_robots(self) -> "ProvedFunnel":
+        """The same with the ellipsoids about x* that lie in every robot's.
+
+        Raises:
+            UserError: somewhere there are none.
+        """
+        apart = np.flatnonzero(self.offsets >= 1)
+        if apart.size:
+            raise UserError(
+                f"the certificate is about own motions, and on interval {int(self.begins[apart[0]])} no state near x* "
+                "is in every robot's funnel: export with a certificate about x* (uncertainty.center: common)"
+            )
+        return replace(self, axes=self.axes * (1 - self.offsets)[:, None, None, None])
 
     def at(self, knots: float) -> Float[np.ndarray, "n n"] | None:
         """L at a time in knots; None before the proof begins."""

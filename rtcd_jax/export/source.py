@@ -146,10 +146,12 @@ first one has {inlet}) failed to arrive with a probability of at most {at_most},
     if bundle.proof is None:
         return f"{sampled} The monitor evaluates it. Nothing is proved: the certificate is {standing.verdict}."
     proved = f"{standing.volumes['inlet']:.4g} {unit}"
+    own = bundle.proof.offsets.any()
+    shared, whose = (", what of it all robots share", "its robot's funnel") if own else ("", "it")
     return f"""\
-The monitor evaluates the **proved** funnel from {standing.start:.6g} s on: every motion of the model that is inside at
-some time stays inside and comes to the goal, in continuous time, within the limits. Its first ellipsoid has
-{proved}. `certificate.json` is the proof, and `rtcd check certificate.json` checks it. The
+The monitor evaluates the **proved** funnel from {standing.start:.6g} s on{shared}: every motion of the model that is
+inside at some time stays in {whose} and comes to the goal, in continuous time, within the limits. Its first ellipsoid
+has {proved}. `certificate.json` is the proof, and `rtcd check certificate.json` checks it. The
 SHA-256 of its claim about this controller stands in the controllers, too:
 `{standing.claim}`.
 

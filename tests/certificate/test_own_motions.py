@@ -19,6 +19,8 @@ from rtcd_jax.certificate.prove.closed_loop import claim_of, floats, hermite, wi
 from rtcd_jax.certificate.prove.uncertainty import bounds_of
 from rtcd_jax.config.schema import UncertaintyConfig
 from rtcd_jax.elite.elite import Elite
+from rtcd_jax.export.proof import ProvedFunnel
+from rtcd_jax.system.errors import UserError
 from tests.certificate import swing
 from tests.certificate.folder import folder_with
 from tests.certificate.test_check import refusal, resealed
@@ -231,3 +233,38 @@ def test_centers_that_go_elsewhere_prove_nothing(content):
 def test_a_higher_degree_in_a_number_asks_for_more_control_points(content):
     content["funnel"][0]["orders"][3] += 1
     assert "must have the cases" in refusal(resealed(content))
+
+
+# What all robots share ------------------------------------------------------------------------------------------------
+
+
+def test_ellipsoids_about_the_nominal_motion_are_in_every_robot_s(content, tmp_path):
+    """Up to the resolution of the bisection no larger ones are."""
+    file = tmp_path / "000.json"
+    file.write_text(json.dumps(content))
+    funnel, claim = ProvedFunnel.read(file), check.read_claim(check.Node("claim", content["claim"]))
+    shared = funnel.of_all_robots()
+
+    def axes(ellipsoids, at):
+        found = ellipsoids.at(at)
+        assert found is not None
+        return found
+
+    cube = np.stack(np.meshgrid(*[np.linspace(-1, 1, 5)] * 2), axis=-1).reshape(-1, 2)
+    values, rates = shifts_at(claim.shifts, cube)
+    most = 0.0
+    for at in np.linspace(3, 3.999, 50):
+        away, _ = hermite(at - 3, float(claim.dt), values[3], rates[3, 0], values[4], rates[3, 1])
+        most = max(most, np.max(np.linalg.norm(np.linalg.solve(axes(funnel, at), away), axis=0)))
+    assert 0 < most <= funnel.offsets[0] < most + 0.02
+    assert np.allclose(axes(shared, 3.5), axes(funnel, 3.5) * (1 - funnel.offsets[0]))
+    assert np.array_equal(axes(shared, 4.0), axes(funnel, 4.0))
+
+
+def test_where_nothing_is_shared_the_export_says_so(content, tmp_path):
+    for part in content["claim"]["shifts"]:
+        part["x"][3:] = [[(1e3 * float.fromhex(c)).hex() for c in row] for row in part["x"][3:]]
+    file = tmp_path / "000.json"
+    file.write_text(json.dumps(resealed(content)))
+    with pytest.raises(UserError, match=r"on interval 3 no state near x\* is in every robot's funnel"):
+        ProvedFunnel.read(file).of_all_robots()

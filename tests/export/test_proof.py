@@ -104,7 +104,7 @@ def random_proof(bundle, first):
     axes = random.normal(size=(len(begins), 4, n, n)) * [[[[1.0]], [[0.1]], [[0.05]], [[0.02]]]]
     axes[-1, 1:] = 0
     axes[0, 0, 0, 0] = 0.0  # asks for a pivot
-    return ProvedFunnel(begins, axes, bundle.rates)
+    return ProvedFunnel(begins, axes, bundle.rates, np.zeros(len(begins)))
 
 
 @needs_compiler

@@ -56,6 +56,7 @@ def test_after_the_motion_the_goal_s_region_counts(dt):
     axes = SIZE * np.linalg.inv(np.linalg.cholesky(elite.S[0])).T
     shrunk = np.zeros((KNOTS, 4, 2, 2))
     shrunk[:-1, 0], shrunk[-1, 0] = 0.5 * axes, axes
-    found = control_rate(elite, ProvedFunnel(np.arange(float(KNOTS)), shrunk, np.zeros((KNOTS - 1, 2, 2))))
+    proof = ProvedFunnel(np.arange(float(KNOTS)), shrunk, np.zeros((KNOTS - 1, 2, 2)), np.zeros(KNOTS))
+    found = control_rate(elite, proof)
     assert found.radius == 1
     assert found.divisor is not None

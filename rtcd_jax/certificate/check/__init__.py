@@ -28,20 +28,21 @@ every instant; they may vary in time). With D = det M, D x' = a + b (u + w). Its
 
 with any F between its bounds, any measurable |w(t)| <= w_max, and the feedback phi = K(r) (x(r) + e - x*(r)), after t_N
 K_g (x(r) + e - x_g), of a measurement at some time r: not more than `age` before, not before the motion began, not by
-the controller of another phase; with any error |e_i| <= `noise`_i. Where the claim has a `jerk`, p is constant in time.
-x* is the cubic Hermite interpolant of the claimed states and rates, K linear between K_k and K_{k+1}. If `check`
-accepts, then with E(t) = {x*(t) + L(t) y : |y| <= 1} and
+the controller of another phase; with any error |e_i| <= `noise`_i. Where the claim has a `jerk` or `shifts`, p is
+constant in time. x* is the cubic Hermite interpolant of the claimed states and rates, K linear between K_k and K_{k+1}.
+c_p is x* plus the `shifts`, each a product of powers of p, scaled to [-1, 1], times such an interpolant; without any,
+c_p is x*. If `check` accepts, then with E(t) = {c_p(t) + L(t) y : |y| <= 1}, each robot's own, and
 G = {x_g + L_g y : |y| <= 1} of the certificate, every motion that is in E(t) at some t of [start, t_N] stays in E until
 t_N, is then in G, never leaves G, and comes and stays as close to x_g as reported; in E and G no state exceeds its
-limit or is in a set of the claim's `keep_out`; and x*(t) + M^-1 (motor) J is in E(t) for all t of [start, t_N] and
-|J| <= `push`.
+limit or is in a set of the claim's `keep_out`; and c_p(t) + M^-1 (motor) J is in E(t) for all t of [start, t_N] and
+|J| <= `push`. At t = 0 c_p is x*(0) for all p.
 
-PROOF. *Funnel.* In y, d/dt |y|^2 = 2 y'L^-1 (f - x*' - L'y). Let L = L(s), s in [-1, 1] the time of one interval,
+PROOF. *Funnel.* In y, d/dt |y|^2 = 2 y'L^-1 (f - c_p' - L'y). Let L = L(s), s in [-1, 1] the time of one interval,
 det L > 0; det M > 0 is shown for all angles and robots (robot.py). Then q = -2 c y' adj(L) (a + b (u + w) -
-D (x*' + L'y)), with a constant c > 0, is -d/dt |y|^2 times a positive function. The feedback differs from K (x - x*) by
-at most `error` = sum_i |K_i| noise_i + age speed, where |d/dt K (x - x*)| <= speed is shown in E. So u + w lies between
-two saturated laws (saturation.py), or four where old measurements count to first order (delay.py), and since q is
-affine in it, it is enough that q > 0 for all. On the sphere |y| = 1 one of three cases holds for each law: it is
+D (c_p' + L'y)), with a constant c > 0, is -d/dt |y|^2 times a positive function. The feedback differs from K (x - x*)
+by at most `error` = sum_i |K_i| noise_i + age speed, where |d/dt K (x - x*)| <= speed is shown in E. So u + w lies
+between two saturated laws (saturation.py), or four where old measurements count to first order (delay.py), and since q
+is affine in it, it is enough that q > 0 for all. On the sphere |y| = 1 one of three cases holds for each law: it is
 free, or at the upper, or at the lower limit. For each, q is a polynomial
 p(s, y, robot) up to a remainder r (sine, cosine and every rounding enclosed). In Bernstein polynomials of the robot's
 numbers it is a mean of its control points, each a polynomial p(s, y), so that it is enough that these are > r; and the
@@ -55,8 +56,12 @@ case. So |y| decreases wherever |y| = 1: no motion leaves E (x' is bounded, and 
 l >= rest. Where no w, noise or age acts, rest = 0, and q is divided by l^2 where u is free: the remainder of q is
 r l^2 + d l, where d bounds what does not vanish with l (x_g is a rounded multiple of pi), and |y| decreases wherever
 l > d / margin.
+*Own motions.* With shifts u_lin = u_k - K (c_p - x* + L y). The conditions of a case are loosened by the largest
+|K (c_p - x*)|, so that they are the same for all robots and hold wherever they do for one. Terms of high order in y and
+p go to the remainder, and so does what p loses where its powers above a degree are replaced by lower ones (|T_k| <= 1).
+The centers c with c + L_N y in G for all |y| <= 1 are convex: the control points of c_p(t_N) are enough.
 *Sets to keep out of.* Each lies in a half space w'(x - c) > offset (keep_out.py), which E does not meet if
-offset - w'(x* - c) > 0 and its square > |L'w|^2, in s; G likewise.
+offset - w'(c_p - c) > 0 and its square > |L'w|^2, in s and the robot's numbers; G likewise.
 *Push.* |L^-1 (b / D) J| < 1 is (D det L)^2 > |adj(L) b J|^2, one inequality in s and the robot's numbers. QED
 
 Every number of a file is an exact double in hexadecimal notation. Digests show where a file was changed; the theorem

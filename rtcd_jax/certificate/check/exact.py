@@ -20,7 +20,7 @@ motions 9520, most of which are zero."""
 MAX_FURTHER = 32
 """Of the monomials of a sum of squares, beside those up to its degree."""
 MAX_BYTES = 1 << 28
-"""Of a file; those of the cart-pole have up to 2e8."""
+"""Of a file; that of the refined cart-pole has 1.7e8."""
 PI = Q(314159265358979323846264338327950288419716939937510, 10**50)
 PI_ERROR = Q(1, 10**49)
 

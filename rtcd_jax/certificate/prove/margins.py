@@ -1,4 +1,6 @@
-"""The largest impulse that a funnel survives, and how its feedback may change, by the checker's bounds."""
+"""The largest impulse that a funnel survives, what of it all robots share, and how its feedback may change, by the
+checker's bounds.
+"""
 
 from collections.abc import Sequence
 from typing import Any, NamedTuple
@@ -7,6 +9,7 @@ import numpy as np
 
 from rtcd_jax.certificate import check
 from rtcd_jax.certificate.check import Claim, Interval, Q
+from rtcd_jax.certificate.check.matrix import dot
 from rtcd_jax.certificate.prove.backward import degrees_of, tiers_of
 from rtcd_jax.certificate.prove.closed_loop import Loop, doubles, on_grid
 from rtcd_jax.certificate.prove.levels import leveled, unit_directions
@@ -14,6 +17,7 @@ from rtcd_jax.elite.elite import Elite
 
 BISECTIONS = 14
 """Of the push margin."""
+BISECTIONS_OF_OFFSET = 8
 SPEED_CLEARANCE = 1.05
 """By which the claimed speed exceeds that of the sampled levels."""
 
@@ -32,6 +36,23 @@ def push_margin(claim: Claim, intervals: Sequence[Interval]) -> float:
         middle = (low + high) / 2
         low, high = (middle, high) if holds(middle) else (low, middle)
     return low
+
+
+def center_offset(claim: Claim, interval: Interval) -> float:
+    """A bound of |L^-1 (c_p - x*)| on an interval, of all robots, by bisection; 1 where it is not less."""
+    data = check.motion(claim, interval)
+    adjugate, determinant = check.cofactors(data.axes)
+    moved = [dot(row, data.shift) for row in adjugate]
+    needed = dot(moved, moved)
+
+    def holds(offset: float) -> bool:
+        return check.is_positive(determinant * determinant * check.rational(offset) ** 2 - needed, claim.cube)
+
+    low, high = 0.0, 1.0
+    for _ in range(BISECTIONS_OF_OFFSET if holds(high) else 0):
+        middle = (low + high) / 2
+        low, high = (low, middle) if holds(middle) else (middle, high)
+    return high
 
 
 class Delay(NamedTuple):
