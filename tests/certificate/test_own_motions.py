@@ -13,7 +13,8 @@ from rtcd_jax.certificate import check
 from rtcd_jax.certificate.check import Q
 from rtcd_jax.certificate.falsify.falsify import Part, summed
 from rtcd_jax.certificate.falsify.simulation import Motions
-from rtcd_jax.certificate.prove.centers import Corners, shifts_at
+from rtcd_jax.certificate.prove.backward import tiers_of
+from rtcd_jax.certificate.prove.centers import Nodes, shifts_at
 from rtcd_jax.certificate.prove.certify import certify_elite
 from rtcd_jax.certificate.prove.closed_loop import claim_of, floats, hermite, with_digests
 from rtcd_jax.certificate.prove.uncertainty import bounds_of
@@ -88,18 +89,25 @@ def test_centers_are_those_of_the_motions_of_robots_inside_the_box(claim):
     assert np.linalg.norm(away - shifts[:, :, 0]) < 0.01 * np.linalg.norm(away)
 
 
-def test_corners_have_the_nominal_robot_first_and_every_combination():
-    corners = Corners.of({"b": (1.0, 3.0), "a": (2.0, 2.0), "c": (0.0, 4.0)})
-    assert not corners.points[0].any()
-    assert {tuple(point) for point in corners.points} == {(i, j) for i in (-1, 0, 1) for j in (-1, 0, 1)}
-    assert np.all(corners.numbers["b"][:, 0] == 2 + corners.points[:, 0])
-    assert np.all(corners.numbers["c"][:, 0] == 2 + 2 * corners.points[:, 1])
-    assert np.all(corners.numbers["a"] == 2)
+def test_nodes_have_the_nominal_robot_first_and_every_combination():
+    nodes = Nodes.of({"b": (1.0, 3.0), "a": (2.0, 2.0), "c": (0.0, 4.0)})
+    assert not nodes.points[0].any()
+    assert {tuple(point) for point in nodes.points} == {(i, j) for i in (-1, 0, 1) for j in (-1, 0, 1)}
+    assert np.all(nodes.numbers["b"][:, 0] == 2 + nodes.points[:, 0])
+    assert np.all(nodes.numbers["c"][:, 0] == 2 + 2 * nodes.points[:, 1])
+    assert np.all(nodes.numbers["a"] == 2)
 
 
 def test_without_an_uncertain_number_there_are_no_shifts():
     moving, common = (UncertaintyConfig(input=W, center=center) for center in ("moving", "common"))
     assert claim_of(elite(), bounds_of(elite(), moving)) == claim_of(elite(), bounds_of(elite(), common))
+
+
+def test_more_numbers_than_polynomials_bear_are_refused_before_the_proof():
+    assert tiers_of(4, 2)[-1].further
+    assert len(tiers_of(4, 3)) < len(tiers_of(4, 2))
+    with pytest.raises(UserError, match=r"own motions with 5 uncertain numbers and 4 states.*common"):
+        tiers_of(4, 5)
 
 
 # Models ---------------------------------------------------------------------------------------------------------------

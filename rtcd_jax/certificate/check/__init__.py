@@ -72,6 +72,7 @@ from rtcd_jax.certificate.check.claim import Claim, Shift
 from rtcd_jax.certificate.check.command import SECONDS, main, within
 from rtcd_jax.certificate.check.delay import jumps_within_reach, lateness
 from rtcd_jax.certificate.check.exact import (
+    MAX_TERMS,
     PI,
     PI_ERROR,
     Damaged,
@@ -86,7 +87,16 @@ from rtcd_jax.certificate.check.exact import (
     root_up,
     up,
 )
-from rtcd_jax.certificate.check.file import Node, digest, parse, read_bytes, read_claim, read_goal, read_interval
+from rtcd_jax.certificate.check.file import (
+    Node,
+    count_terms,
+    digest,
+    parse,
+    read_bytes,
+    read_claim,
+    read_goal,
+    read_interval,
+)
 from rtcd_jax.certificate.check.funnel import (
     Interval,
     Motion,

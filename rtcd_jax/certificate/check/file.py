@@ -352,11 +352,16 @@ def require_few_terms(node: Node, n: int, s_order: int, y_order: int, of_robots:
     """A polynomial of these orders in s, in y and in so many numbers, a power of which counts as so many of y, must be
     small enough to be multiplied in seconds.
     """
+    terms = count_terms(n, s_order, y_order, of_robots)
+    node.require(terms <= MAX_TERMS, f"asks for polynomials of {terms} terms, must be at most {MAX_TERMS}")
+
+
+def count_terms(n: int, s_order: int, y_order: int, of_robots: tuple[int, int]) -> int:
+    """Of a polynomial as `require_few_terms` has it."""
     m, stride = of_robots
     powers = range(y_order // stride + 1) if m else range(1)
     each = [math.comb(max(m + k - 1, 0), k) * math.comb(y_order - stride * k + n, n) for k in powers]
-    terms = (s_order + 1) * sum(each)
-    node.require(terms <= MAX_TERMS, f"asks for polynomials of {terms} terms, must be at most {MAX_TERMS}")
+    return (s_order + 1) * sum(each)
 
 
 def read_interval(node: Node, claim: Claim) -> Interval:

@@ -20,6 +20,7 @@ from rtcd_jax.certificate.prove import sdp as program
 from rtcd_jax.certificate.prove.closed_loop import Loop, on_grid
 from rtcd_jax.certificate.prove.levels import followed, unit_directions
 from rtcd_jax.certificate.prove.sdp import Shape
+from rtcd_jax.system.errors import UserError
 
 DECAY_MARGINS = {
     2: (0.005, 0.015, 0.04, 0.1, 0.25, 0.6, 1.5, 4.0, 10.0, 25.0),
@@ -91,14 +92,35 @@ ERROR_FRACTION = 1 / 3
 """A Taylor model is good enough if its error is at most this fraction of the decay margin."""
 
 
-def tiers_of(claim: Claim) -> tuple[Tier, ...]:
-    """The cheapest first."""
-    return (TIERS_OF_OWN_MOTIONS if claim.shifts else TIERS)[claim.n]
+def tiers_of(n: int, moving: int) -> tuple[Tier, ...]:
+    """The cheapest first, for so many states, and about own motions so many uncertain numbers, else 0.
+
+    Raises:
+        UserError: there are none.
+    """
+    if n not in TIERS:
+        raise UserError(f"no certificate for {n} states: proofs are for {' and '.join(map(str, TIERS))}")
+    tiers = tuple(
+        tier
+        for tier in (TIERS_OF_OWN_MOTIONS if moving else TIERS)[n]
+        if check.count_terms(n, tier.time_order, tier.order, (moving, tier.stride)) <= check.MAX_TERMS
+    )
+    if not tiers:
+        raise UserError(
+            f"no certificate about own motions with {moving} uncertain numbers and {n} states: its polynomials would be "
+            "too long; `center: common` has no such limit"
+        )
+    return tiers
+
+
+def moving(claim: Claim) -> int:
+    """The uncertain numbers, if the claim is about own motions."""
+    return len(claim.uncertain) if claim.shifts else 0
 
 
 def degrees_of(claim: Claim) -> list[tuple[int, ...]]:
     """In the robot's numbers about own motions, those with the fewest control points first; else nothing but ()."""
-    choices = itertools.product(range(1, HIGHEST_DEGREE + 1), repeat=len(claim.uncertain) if claim.shifts else 0)
+    choices = itertools.product(range(1, HIGHEST_DEGREE + 1), repeat=moving(claim))
     return sorted(choices, key=lambda degrees: (math.prod(degree + 1 for degree in degrees), degrees))
 
 
@@ -210,7 +232,7 @@ class BackwardProof:
         fractions = check.rational(start), check.rational(end)
         late = loop.late_rows(k, start, end) if self.claim.first_order else []
         sides = loop.sides(k, start, end)
-        orders = tiers_of(self.claim)[0].orders(self.claim, degrees_of(self.claim)[0])
+        orders = tiers_of(self.claim.n, moving(self.claim))[0].orders(self.claim, degrees_of(self.claim)[0])
         return Interval(k, *fractions, on_grid(a), state.axes, bend, orders, {}, late, sides), rho
 
     def _models(
@@ -220,7 +242,7 @@ class BackwardProof:
         of their programs.
         """
         degrees, allowed = degrees_of(self.claim), ERROR_FRACTION * decay_margin
-        for tier in tiers_of(self.claim):
+        for tier in tiers_of(self.claim.n, moving(self.claim)):
             interval = interval._replace(orders=tier.orders(self.claim, degrees[0]))
             models = check.funnel_models(self.claim, interval, "interval")
             own = max(float(q.r + q.d) for _, q in models.values())

@@ -17,14 +17,14 @@ DEGREE = 2
 """Of the centers in the robots' numbers."""
 
 
-class Corners(NamedTuple):
+class Nodes(NamedTuple):
     """Robots of a box: points p [J m] of {-1, 0, 1}^m, the first 0, and their numbers [J 1]."""
 
     points: Float[np.ndarray, "J m"]
     numbers: dict[str, Float[np.ndarray, "J 1"]]
 
     @classmethod
-    def of(cls, parameters: dict[str, tuple[float, float]]) -> "Corners":
+    def of(cls, parameters: dict[str, tuple[float, float]]) -> "Nodes":
         """Of least and largest values by name; those that differ are uncertain."""
         uncertain = sorted(name for name, (low, high) in parameters.items() if low < high)
         points = np.array(sorted(itertools.product((-1.0, 0.0, 1.0), repeat=len(uncertain)), key=np.any))
@@ -48,10 +48,10 @@ def fitted(
     and its rates as a claim has them, u* and K.
     """
     x, rates, u, gains = motion
-    corners = Corners.of(parameters)
+    nodes = Nodes.of(parameters)
     uncertain = sorted(name for name, (low, high) in parameters.items() if low < high)
-    away, slopes = np.zeros((len(corners.points), *x.shape)), np.zeros((len(corners.points), *rates.shape))
-    now = np.repeat(x[0][:, None], len(corners.points), axis=1)
+    away, slopes = np.zeros((len(nodes.points), *x.shape)), np.zeros((len(nodes.points), *rates.shape))
+    now = np.repeat(x[0][:, None], len(nodes.points), axis=1)
     for k in range(len(u)):
         ends = dt, x[k], rates[k, 0], x[k + 1], rates[k, 1]
 
@@ -59,7 +59,7 @@ def fitted(
             gain = (1 - fraction) * gains[k] + fraction * gains[k + 1]
             error = state - cubic_hermite(fraction, *ends)[:, None]
             asked = np.clip(u[k] - gain @ error, -limit, limit)
-            return rate(robot, corners.numbers, state[:, :, None], asked[:, None])[:, :, 0]
+            return rate(robot, nodes.numbers, state[:, :, None], asked[:, None])[:, :, 0]
 
         slopes[:, k, 0] = (moving(0.0, now) - rates[k, 0][:, None]).T
         step = 1 / STEPS
@@ -73,7 +73,7 @@ def fitted(
         slopes[:, k, 1] = (moving(1.0, now) - rates[k, 1][:, None]).T
         away[:, k + 1] = (now - x[k + 1][:, None]).T
     powers = [e for e in itertools.product(range(DEGREE + 1), repeat=len(uncertain)) if 0 < sum(e) <= DEGREE]
-    terms = np.stack([np.prod(corners.points ** np.array(e), axis=1) for e in powers], axis=1)
+    terms = np.stack([np.prod(nodes.points ** np.array(e), axis=1) for e in powers], axis=1)
     inverse = np.linalg.pinv(terms)
     parts = zip(powers, *(np.tensordot(inverse, each, 1) for each in (away, slopes)), strict=True)
     return [

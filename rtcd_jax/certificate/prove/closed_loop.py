@@ -8,7 +8,7 @@ import numpy as np
 from scipy.optimize import brentq
 
 from rtcd_jax.certificate import check
-from rtcd_jax.certificate.prove.centers import Corners, fitted, shifts_at
+from rtcd_jax.certificate.prove.centers import Nodes, fitted, shifts_at
 from rtcd_jax.certificate.prove.field import ControlPoints, linear, rate
 from rtcd_jax.certificate.prove.robot import ClaimedRobot, claimed_robot
 from rtcd_jax.certificate.prove.uncertainty import Bounds, bounds_of
@@ -162,9 +162,9 @@ class Loop:
         self._points = self._robots = ControlPoints.of(claim)
         self._shifts = np.zeros((len(claim.x), self.n, 1)), np.zeros((len(claim.u), 2, self.n, 1))
         if claim.shifts:
-            corners = Corners.of({name: (float(low), float(high)) for name, (low, high) in claim.parameters.items()})
-            self._robots = ControlPoints(corners.numbers, np.eye(len(corners.points)))
-            self._shifts = shifts_at(claim.shifts, corners.points)
+            nodes = Nodes.of({name: (float(low), float(high)) for name, (low, high) in claim.parameters.items()})
+            self._robots = ControlPoints(nodes.numbers, np.eye(len(nodes.points)))
+            self._shifts = shifts_at(claim.shifts, nodes.points)
         self.x, self.rates, self.u = floats(claim.x), floats(claim.rates), floats(claim.u)
         self.gains, self.goal, self.goal_gain = floats(claim.K), floats(claim.x_goal), floats(claim.K_goal)
         self.bounds = np.array([np.inf if b is None else float(b) for b in claim.bounds])
@@ -205,7 +205,7 @@ class Loop:
         return hermite(fraction, self.dt, self.x[k], self.rates[k, 0], self.x[k + 1], self.rates[k, 1])
 
     def shift(self, k: int, fraction: float) -> tuple[np.ndarray, np.ndarray]:
-        """c_p - x* and its rate [n J] of the robots at the corners, the first of which is the nominal one."""
+        """c_p - x* and its rate [n J] of the robots at the `Nodes`, the first of which is the nominal one."""
         x, rates = self._shifts
         return hermite(fraction, self.dt, x[k], rates[k, 0], x[k + 1], rates[k, 1])
 

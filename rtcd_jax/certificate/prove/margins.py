@@ -10,7 +10,7 @@ import numpy as np
 from rtcd_jax.certificate import check
 from rtcd_jax.certificate.check import Claim, Interval, Q
 from rtcd_jax.certificate.check.matrix import dot
-from rtcd_jax.certificate.prove.backward import degrees_of, tiers_of
+from rtcd_jax.certificate.prove.backward import degrees_of, moving, tiers_of
 from rtcd_jax.certificate.prove.closed_loop import Loop, doubles, on_grid
 from rtcd_jax.certificate.prove.levels import leveled, unit_directions
 from rtcd_jax.elite.elite import Elite
@@ -80,13 +80,14 @@ def feedback_delay(claim: Claim, elite: Elite) -> Delay:
         Refused: there are no such levels.
     """
     loop = leveled(Loop(claim._replace(age=Q(0), jerk=None), elite), unit_directions(claim.n))
-    orders, zero = tiers_of(claim)[0].orders(claim, degrees_of(claim)[0]), np.zeros((claim.n, claim.n))
+    tier = tiers_of(claim.n, moving(claim))[0]
+    orders, zero = tier.orders(claim, degrees_of(claim)[0]), np.zeros((claim.n, claim.n))
     bend = [on_grid(zero), on_grid(zero)]
     intervals = []
     for k in range(len(claim.u)):
         first, last = (on_grid(loop.axes(k, end, 1.0, 0.0)[0]) for end in (0.0, 1.0))
         intervals.append(Interval(k, Q(0), Q(1), first, last, bend, orders, {}, loop.late_rows(k, 0.0, 1.0)))
-    axes, order = on_grid(loop.axes(len(claim.u) - 1, 1.0, 1.0, 0.0)[0]), tiers_of(claim)[0].order
+    axes, order = on_grid(loop.axes(len(claim.u) - 1, 1.0, 1.0, 0.0)[0]), tier.order
     speeds = [check.funnel_speed(claim, interval, "speed") for interval in intervals]
     speed = SPEED_CLEARANCE * float(max(*speeds, check.goal_speed(claim, axes, order, "speed")))
     claim = claim._replace(speed=check.rational(speed))

@@ -12,7 +12,7 @@ from typing import Any, cast
 
 from scipy.stats import spearmanr
 
-from rtcd_jax.certificate.prove.backward import TIERS
+from rtcd_jax.certificate.prove.backward import tiers_of
 from rtcd_jax.certificate.prove.certify import Checking, Outcome, Step, certify_elite
 from rtcd_jax.certificate.prove.closed_loop import claim_of
 from rtcd_jax.certificate.prove.sdp import SOLVER, require_solver
@@ -20,7 +20,6 @@ from rtcd_jax.certificate.prove.uncertainty import bounds_of, uncertainty_of
 from rtcd_jax.elite.elite import Elite
 from rtcd_jax.elite.records import require_elites, require_held_goal
 from rtcd_jax.system.console import Clock, Console, Progress, table, times
-from rtcd_jax.system.errors import UserError
 from rtcd_jax.system.files import in_turn, make_folder, read_json, replace_json
 from rtcd_jax.system.processes import CONTEXT, processes
 
@@ -94,9 +93,9 @@ def certify_run(
     names = require_elites(folder)[:elites] if only is None else [only]
     for name in names:  # at once, and not from a worker
         elite = Elite.read(folder, name)
-        claim_of(elite, bounds_of(elite, uncertainty_of(elite, uncertainty)))
-        if (n := len(elite.x_goal)) not in TIERS:
-            raise UserError(f"no certificate for {n} states: proofs are for {' and '.join(map(str, TIERS))}")
+        bounds = bounds_of(elite, uncertainty_of(elite, uncertainty))
+        claim_of(elite, bounds)
+        tiers_of(len(elite.x_goal), sum(low < high for low, high in bounds.parameters.values()) * bounds.moving)
     target = folder / "certificates"
     make_folder(target)
     summary = target / "summary.json"
