@@ -107,8 +107,8 @@ def tiers_of(n: int, moving: int) -> tuple[Tier, ...]:
     )
     if not tiers:
         raise UserError(
-            f"no certificate about own motions with {moving} uncertain numbers and {n} states: its polynomials would be "
-            "too long; `center: common` has no such limit"
+            f"no certificate about own motions with {moving} uncertain numbers and {n} states: its polynomials would "
+            "be too long; `center: common` has no such limit"
         )
     return tiers
 
