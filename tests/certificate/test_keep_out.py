@@ -10,7 +10,8 @@ import pytest
 from rtcd_jax.certificate import check
 from rtcd_jax.certificate.falsify.simulation import Motions
 from rtcd_jax.certificate.prove.certify import certify_elite
-from rtcd_jax.certificate.prove.closed_loop import _touched, floats
+from rtcd_jax.certificate.prove.closed_loop import _touched
+from rtcd_jax.certificate.prove.field import floats
 from rtcd_jax.certificate.standing import standing_of
 from rtcd_jax.elite.elite import Elite
 from rtcd_jax.numerics.ellipsoid import Ellipsoids

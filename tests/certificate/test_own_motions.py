@@ -16,7 +16,8 @@ from rtcd_jax.certificate.falsify.simulation import Motions
 from rtcd_jax.certificate.prove.backward import tiers_of
 from rtcd_jax.certificate.prove.centers import Nodes, shifts_at
 from rtcd_jax.certificate.prove.certify import certify_elite
-from rtcd_jax.certificate.prove.closed_loop import claim_of, floats, hermite, with_digests
+from rtcd_jax.certificate.prove.closed_loop import claim_of, hermite, with_digests
+from rtcd_jax.certificate.prove.field import floats
 from rtcd_jax.certificate.prove.uncertainty import bounds_of
 from rtcd_jax.config.schema import UncertaintyConfig
 from rtcd_jax.elite.elite import Elite

@@ -8,7 +8,8 @@ import numpy as np
 from jaxtyping import Float
 
 from rtcd_jax.certificate import check
-from rtcd_jax.certificate.prove.field import rate
+from rtcd_jax.certificate.prove.field import floats, rate
+from rtcd_jax.elite.closed_loop import runge_kutta_step
 from rtcd_jax.numerics.hermite import cubic_hermite
 
 STEPS = 8
@@ -62,14 +63,8 @@ def fitted(
             return rate(robot, nodes.numbers, state[:, :, None], asked[:, None])[:, :, 0]
 
         slopes[:, k, 0] = (moving(0.0, now) - rates[k, 0][:, None]).T
-        step = 1 / STEPS
         for i in range(STEPS):
-            at = i * step
-            a = moving(at, now)
-            b = moving(at + step / 2, now + dt * step / 2 * a)
-            c = moving(at + step / 2, now + dt * step / 2 * b)
-            d = moving(at + step, now + dt * step * c)
-            now = now + dt * step / 6 * (a + 2 * (b + c) + d)
+            now = runge_kutta_step(lambda part, state, i=i: moving((i + part) / STEPS, state), now, dt / STEPS)
         slopes[:, k, 1] = (moving(1.0, now) - rates[k, 1][:, None]).T
         away[:, k + 1] = (now - x[k + 1][:, None]).T
     powers = [e for e in itertools.product(range(DEGREE + 1), repeat=len(uncertain)) if 0 < sum(e) <= DEGREE]
@@ -87,9 +82,5 @@ def shifts_at(shifts: Sequence[check.Shift], points: Float[np.ndarray, "J m"]) -
     x = rates = np.zeros(1)
     for powers, values, turns in shifts:
         factor = np.prod(points ** np.array(powers), axis=1)
-        x, rates = x + _floats(values)[..., None] * factor, rates + _floats(turns)[..., None] * factor
+        x, rates = x + floats(values)[..., None] * factor, rates + floats(turns)[..., None] * factor
     return x, rates
-
-
-def _floats(values: Any) -> np.ndarray:
-    return np.array(values, dtype=object).astype(float)

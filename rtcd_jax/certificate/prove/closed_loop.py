@@ -9,7 +9,7 @@ from scipy.optimize import brentq
 
 from rtcd_jax.certificate import check
 from rtcd_jax.certificate.prove.centers import Nodes, fitted, shifts_at
-from rtcd_jax.certificate.prove.field import ControlPoints, linear, rate
+from rtcd_jax.certificate.prove.field import ControlPoints, floats, linear, rate
 from rtcd_jax.certificate.prove.robot import ClaimedRobot, claimed_robot
 from rtcd_jax.certificate.prove.uncertainty import Bounds, bounds_of
 from rtcd_jax.config.schema import UncertaintyConfig
@@ -407,11 +407,6 @@ def _highest(f: Callable[[np.ndarray], np.ndarray], directions: np.ndarray) -> f
         values = f(tries.reshape(len(best), -1)).reshape(best.shape[1], -1)
         best = np.take_along_axis(tries, values.argmax(axis=1)[None, :, None], axis=2)[:, :, 0]
     return float(values.max())
-
-
-def floats(values: Any) -> np.ndarray:
-    """Nested lists of exact numbers as doubles."""
-    return np.array(values, dtype=object).astype(float)
 
 
 def hermite(fraction: Any, dt: float, a: Any, a_rate: Any, b: Any, b_rate: Any) -> tuple[Any, Any]:

@@ -95,3 +95,8 @@ class ControlPoints(NamedTuple):
             )
             for each in field(robot, self.numbers, x if x.ndim == 3 else x[:, None])
         )
+
+
+def floats(values: Any) -> np.ndarray:
+    """Nested lists of exact numbers as doubles."""
+    return np.array(values, dtype=object).astype(float)

@@ -7,7 +7,8 @@ import numpy as np
 from rtcd_jax.certificate import check
 from rtcd_jax.certificate.check import Claim, Refused, Shell
 from rtcd_jax.certificate.prove.backward import Tier, prove
-from rtcd_jax.certificate.prove.closed_loop import Loop, floats, on_grid
+from rtcd_jax.certificate.prove.closed_loop import Loop, on_grid
+from rtcd_jax.certificate.prove.field import floats
 from rtcd_jax.certificate.prove.levels import goal_level, unit_directions
 from rtcd_jax.certificate.prove.sdp import SOLVER
 
