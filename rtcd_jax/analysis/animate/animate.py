@@ -73,12 +73,14 @@ def animate_run(folder: Path, to: Path | None, seed: int, console: Console) -> l
     columns = _columns(folder, config, seed, console)
     console.message(f"rendering {len(columns[0].motions.time)} frames by MuJoCo ({backend})")
     size = SIDE * len(columns) + GAP * (len(columns) - 1), 2 * SIDE + GAP
-    return write_videos(_frames(columns, size, console), size, target, console)
+    return write_videos(_frames(columns, size), len(columns[0].motions.time), size, target, console)
 
 
-def write_videos(frames: Iterable["Image"], size: tuple[int, int], target: Path, console: Console) -> list[Path]:
-    """Writes frames of this size as `swingup.gif` and, with an ffmpeg, `swingup.mp4` into a folder."""
-    program = ffmpeg()
+def write_videos(
+    frames: Iterable["Image"], count: int, size: tuple[int, int], target: Path, console: Console
+) -> list[Path]:
+    """Writes so many frames of this size as `swingup.gif` and, with an ffmpeg, `swingup.mp4` into a folder."""
+    program, clock = ffmpeg(), Clock()
     written = [target / "swingup.gif", target / "swingup.mp4"][: 1 + bool(program)]
     with mp4(written[1], size, program) if program else contextlib.nullcontext() as add:
         small = []
@@ -87,6 +89,8 @@ def write_videos(frames: Iterable["Image"], size: tuple[int, int], target: Path,
                 small.append(frame.resize((size[0] // 2, size[1] // 2)))
             if add:
                 add(frame)
+            if (k + 1) % RATE == 0 or k + 1 == count:
+                console.progress(Progress(k + 1, count, f"frame {k + 1} of {count}  {clock.times(k + 1, count)}"))
         _write_gif(small, written[0])
     if not program:
         console.message("no MP4: there is no ffmpeg; install it, or `pip install -e '.[video]'`")
@@ -131,17 +135,16 @@ def disturbed_start(elite: Elite, seed: int) -> np.ndarray:
     return elite.x[0] + np.sqrt(NEAR * elite.rho[0] / elite.value(0, drawn)) * (drawn[0] - elite.x[0])
 
 
-def _frames(columns: Sequence[Column], size: tuple[int, int], console: Console) -> Iterator["Image"]:
+def _frames(columns: Sequence[Column], size: tuple[int, int]) -> Iterator["Image"]:
     from PIL import Image
 
-    frames, clock = len(columns[0].motions.time), Clock()
     with contextlib.ExitStack() as stack:
         cameras = [stack.enter_context(Camera(column.model, SIDE, SIDE)) for column in columns]
         paths = [column.positions.reshape(-1, column.positions.shape[-1]) for column in columns]
         reach = max(camera.reach(path) for camera, path in zip(cameras, paths, strict=True))
         for camera in cameras:
             camera.frame(MARGIN * reach)
-        for k in range(frames):
+        for k in range(len(columns[0].motions.time)):
             frame = Image.new("RGB", size, "white")
             for i, (column, camera) in enumerate(zip(columns, cameras, strict=True)):
                 for row, positions in enumerate(column.positions[k]):
@@ -150,8 +153,6 @@ def _frames(columns: Sequence[Column], size: tuple[int, int], console: Console) 
                     write_on(panel, titles, float(column.motions.time[k]), float(column.motions.ratio[k, row]))
                     frame.paste(panel, (i * (SIDE + GAP), row * (SIDE + GAP)))
             yield frame
-            if (k + 1) % RATE == 0 or k + 1 == frames:
-                console.progress(Progress(k + 1, frames, f"frame {k + 1} of {frames}  {clock.times(k + 1, frames)}"))
 
 
 def write_on(panel: "Image", titles: tuple[str, str], time: float, ratio: float) -> None:

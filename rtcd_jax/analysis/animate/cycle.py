@@ -22,7 +22,7 @@ from rtcd_jax.elite.funnel import FunnelInterpolant
 from rtcd_jax.elite.records import read_config, require_elites, task_folders
 from rtcd_jax.plants import brachiation
 from rtcd_jax.problem import RESETS
-from rtcd_jax.system.console import Clock, Console, Progress
+from rtcd_jax.system.console import Console
 from rtcd_jax.system.files import make_folder
 
 if TYPE_CHECKING:
@@ -62,7 +62,7 @@ def animate_cycle(run: Path, to: Path | None, seed: int, swings: int, console: C
     course, bars = _course(run, seed, swings)
     frames = math.ceil((course[-1].begin + float(course[-1].motions.time[-1]) + HOLD) * RATE) + 1
     console.message(f"rendering {frames} frames of {swings} swings by MuJoCo ({backend})")
-    return write_videos(_frames(course, bars, frames, console), (WIDTH, 2 * HEIGHT + GAP), target, console)
+    return write_videos(_frames(course, bars, frames), frames, (WIDTH, 2 * HEIGHT + GAP), target, console)
 
 
 def _course(run: Path, seed: int, swings: int) -> tuple[list[Swing], Float[np.ndarray, " bars"]]:
@@ -103,12 +103,9 @@ def _dress(model: Any, exchanged: bool) -> None:
         model.mat_rgba[pair] = model.mat_rgba[pair[::-1]]
 
 
-def _frames(
-    course: Sequence[Swing], bars: Float[np.ndarray, " bars"], frames: int, console: Console
-) -> Iterator["Image"]:
+def _frames(course: Sequence[Swing], bars: Float[np.ndarray, " bars"], frames: int) -> Iterator["Image"]:
     from PIL import Image
 
-    clock = Clock()
     width, middle = ROOM * (bars[-1] - bars[0]), (bars[-1] + bars[0]) / 2
     with contextlib.ExitStack() as stack:
         models = {id(swing.model): swing.model for swing in course}
@@ -128,5 +125,3 @@ def _frames(
                 write_on(panel, titles, time, float(swing.motions.ratio[at, row]))
                 frame.paste(panel, (0, row * (HEIGHT + GAP)))
             yield frame
-            if (k + 1) % RATE == 0 or k + 1 == frames:
-                console.progress(Progress(k + 1, frames, f"frame {k + 1} of {frames}  {clock.times(k + 1, frames)}"))

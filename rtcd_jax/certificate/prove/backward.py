@@ -159,6 +159,7 @@ class BackwardProof:
     def __init__(self, claim: Claim, loop: Loop, exact: bool, solver: str = program.SOLVER):
         self.claim, self.loop, self.exact, self.solver = claim, loop, exact, solver
         self._directions, self._rates = unit_directions(claim.n), DECAY_MARGINS[claim.n]
+        self._tiers, self._degrees = tiers_of(claim.n, moving(claim)), degrees_of(claim)
 
     def outlet(self, rho: float) -> ProofState:
         """The state at which the proof begins: t_N with the level rho."""
@@ -232,7 +233,7 @@ class BackwardProof:
         fractions = check.rational(start), check.rational(end)
         late = loop.late_rows(k, start, end) if self.claim.first_order else []
         sides = loop.sides(k, start, end)
-        orders = tiers_of(self.claim.n, moving(self.claim))[0].orders(self.claim, degrees_of(self.claim)[0])
+        orders = self._tiers[0].orders(self.claim, self._degrees[0])
         return Interval(k, *fractions, on_grid(a), state.axes, bend, orders, {}, late, sides), rho
 
     def _models(
@@ -241,16 +242,16 @@ class BackwardProof:
         """The interval's obligations by the cheapest Taylor models that are good enough, or the richest, and the shapes
         of their programs.
         """
-        degrees, allowed = degrees_of(self.claim), ERROR_FRACTION * decay_margin
-        for tier in tiers_of(self.claim.n, moving(self.claim)):
-            interval = interval._replace(orders=tier.orders(self.claim, degrees[0]))
+        allowed = ERROR_FRACTION * decay_margin
+        for tier in self._tiers:
+            interval = interval._replace(orders=tier.orders(self.claim, self._degrees[0]))
             models = check.funnel_models(self.claim, interval, "interval")
             own = max(float(q.r + q.d) for _, q in models.values())
             if own <= allowed:
                 break
-        for each in degrees:
-            interval = interval._replace(orders=tier.orders(self.claim, each))
-            todo = check.obligations_of(self.claim, models, each)
+        for degrees in self._degrees:
+            interval = interval._replace(orders=tier.orders(self.claim, degrees))
+            todo = check.obligations_of(self.claim, models, degrees)
             if max(float(each.error) for each in todo.values()) <= max(allowed, ENOUGH_OF_DEGREES * own):
                 break
         return interval, todo, tier.shapes(todo, self.loop, FEWEST)

@@ -19,8 +19,11 @@ DEGREE = 2
 
 
 class Nodes(NamedTuple):
-    """Robots of a box: points p [J m] of {-1, 0, 1}^m, the first 0, and their numbers [J 1]."""
+    """Robots of a box: the names of its m uncertain numbers, points p [J m] of {-1, 0, 1}^m, the first 0, and the
+    robots' numbers [J 1].
+    """
 
+    uncertain: list[str]
     points: Float[np.ndarray, "J m"]
     numbers: dict[str, Float[np.ndarray, "J 1"]]
 
@@ -33,7 +36,7 @@ class Nodes(NamedTuple):
         for name, (low, high) in parameters.items():
             place = points[:, uncertain.index(name)] if name in uncertain else np.zeros(len(points))
             numbers[name] = ((low + high) / 2 + (high - low) / 2 * place)[:, None]
-        return cls(points, numbers)
+        return cls(uncertain, points, numbers)
 
 
 def fitted(
@@ -50,7 +53,6 @@ def fitted(
     """
     x, rates, u, gains = motion
     nodes = Nodes.of(parameters)
-    uncertain = sorted(name for name, (low, high) in parameters.items() if low < high)
     away, slopes = np.zeros((len(nodes.points), *x.shape)), np.zeros((len(nodes.points), *rates.shape))
     now = np.repeat(x[0][:, None], len(nodes.points), axis=1)
     for k in range(len(u)):
@@ -67,12 +69,12 @@ def fitted(
             now = runge_kutta_step(lambda part, state, i=i: moving((i + part) / STEPS, state), now, dt / STEPS)
         slopes[:, k, 1] = (moving(1.0, now) - rates[k, 1][:, None]).T
         away[:, k + 1] = (now - x[k + 1][:, None]).T
-    powers = [e for e in itertools.product(range(DEGREE + 1), repeat=len(uncertain)) if 0 < sum(e) <= DEGREE]
+    powers = [e for e in itertools.product(range(DEGREE + 1), repeat=len(nodes.uncertain)) if 0 < sum(e) <= DEGREE]
     terms = np.stack([np.prod(nodes.points ** np.array(e), axis=1) for e in powers], axis=1)
     inverse = np.linalg.pinv(terms)
     parts = zip(powers, *(np.tensordot(inverse, each, 1) for each in (away, slopes)), strict=True)
     return [
-        {"powers": {name: e for name, e in zip(uncertain, each, strict=True) if e}, "x": values, "rates": turns}
+        {"powers": {name: e for name, e in zip(nodes.uncertain, each, strict=True) if e}, "x": values, "rates": turns}
         for each, values, turns in parts
     ]
 
