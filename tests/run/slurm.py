@@ -13,6 +13,9 @@ from pathlib import Path
 
 PROGRAMS = ("munged", "slurmctld", "slurmd", "sbatch", "srun", "scontrol")
 
+# What a job ends in; SIGNALING, COMPLETING, REQUEUED and the like only pass.
+ENDS = ("COMPLETED", "CANCELLED", "FAILED", "TIMEOUT", "DEADLINE", "NODE_FAIL", "BOOT_FAIL", "OUT_OF_MEMORY")
+
 CONFIGURATION = """
 ClusterName=rtcdtest
 SlurmctldHost={host}(127.0.0.1)
@@ -96,10 +99,10 @@ class Slurm:
         """What Slurm says of a job."""
         return dict(word.split("=", 1) for word in self.call("scontrol", "show", "job", number).split() if "=" in word)
 
-    def ended(self, number: str, seconds: float = 120) -> dict[str, str]:
+    def ended(self, number: str, seconds: float = 300) -> dict[str, str]:
         """Waits for a job's end, however often it is requeued; a requeued job starts at once."""
         begun = time.monotonic()
-        while (job := self.job(number))["JobState"] in ("PENDING", "RUNNING", "COMPLETING", "REQUEUED", "CONFIGURING"):
+        while (job := self.job(number))["JobState"] not in ENDS:
             if job["JobState"] == "PENDING" and job["Restarts"] != "0":
                 self.call("scontrol", "update", f"JobId={number}", "StartTime=now", check=False)
             assert time.monotonic() - begun < seconds, job
