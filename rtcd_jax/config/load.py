@@ -460,11 +460,18 @@ def load_uncertainty(path: Path) -> UncertaintyConfig:
 
 
 def read_uncertainty(path: Path) -> Any:
-    """The `uncertainty` section of a YAML file, or a file of its keys alone, as it stands there."""
+    """The `uncertainty` section of a YAML file, or a file of its keys alone, as it stands there.
+
+    Raises:
+        ConfigError: as `read_yaml`, or it is empty: what nobody stated is not taken as one exact model.
+    """
     data = read_yaml(path)
     if isinstance(data, Mapping) and "uncertainty" in data:
         data = data["uncertainty"]
-    return {} if data is None else data
+    if data is None:
+        keys = ", ".join(UncertaintyConfig.model_fields)
+        raise ConfigError([Problem((), f"states no uncertainty: must have some of {keys}")], str(path))
+    return data
 
 
 def read_yaml(path: Path) -> Any:

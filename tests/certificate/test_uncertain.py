@@ -476,6 +476,8 @@ def test_a_file_whose_old_measurements_count_by_their_speed_alone_is_decided_sti
         ("design: {weight: 0.1}", "no number of the pendulum is 'weight'; "),
         ("input: -1", "input = -1: must be >= 0"),
         ("noise: [0.1]", "uncertainty.noise: has 1 entries, must have 2"),
+        ("", "states no uncertainty"),
+        ("uncertainty:", "states no uncertainty"),
         ("inptu: 1", "inptu"),
     ],
 )
