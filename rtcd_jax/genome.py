@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from rtcd_jax.problem import Problem, Variable
-from rtcd_jax.types import Candidate
+from rtcd_jax.types import Candidate, TaskNumbers
 
 
 def decode(problem: Problem, genome: Float[Array, " d"], task: Int[Array, ""] | None = None) -> Candidate:
@@ -33,22 +33,29 @@ def decode(problem: Problem, genome: Float[Array, " d"], task: Int[Array, ""] | 
     def section(prefix: str) -> list[Array]:
         return [value for name, value in values.items() if name.startswith(prefix)]
 
+    design, own = _of_task(problem, problem.plant.Design(*section("design.")), task)
     return Candidate(
-        design=_edited(problem, problem.plant.Design(*section("design.")), task),
+        design=design,
         q=jnp.stack(section("weights.q.")),
         r=jnp.stack(section("weights.r.")),
         policy={name.removeprefix("policy."): value for name, value in values.items() if name.startswith("policy.")},
         task=task,
+        own=own,
     )
 
 
-def _edited(problem: Problem, design: eqx.Module, task: Int[Array, ""] | None) -> eqx.Module:
-    """The design as the task has it; that of several tasks in common where none of them is meant."""
+def _of_task(
+    problem: Problem, design: eqx.Module, task: Int[Array, ""] | None
+) -> tuple[eqx.Module, TaskNumbers | None]:
+    """The design as the task has it, and what else of it follows; that of several tasks in common where none of them
+    is meant.
+    """
+    following = problem.following
     if not problem.tasks:
-        return problem.edited(design)
+        return problem.of_design(design, following)
     if task is None:
-        return design
-    each = [alone.edited(design) for alone in problem.tasks]
+        return design, None
+    each = [alone.of_design(design, following) for alone in problem.tasks]
     return jax.tree.map(lambda *leaves: jnp.stack(leaves)[task], *each)
 
 

@@ -1,6 +1,6 @@
 """What stays fixed during a run: the robot, the task, the time grid, the searched variables."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, NamedTuple
@@ -20,7 +20,7 @@ from rtcd_jax.plants.base import Plant
 from rtcd_jax.system.devices import require_float64
 from rtcd_jax.system.errors import ConfigError
 from rtcd_jax.system.errors import Problem as Fault
-from rtcd_jax.types import Candidate, Uncertainty
+from rtcd_jax.types import Candidate, TaskNumbers, Uncertainty
 
 AT_REST = 1e-6
 """Largest rate of a goal [state/s]: one typed with 16 digits leaves the rounding of pi times the stiffness."""
@@ -139,10 +139,11 @@ class Problem:
 
     def of(self, candidate: Candidate) -> "Problem":
         """The problem as this candidate has it: with several tasks, start, goal and robot are those of its own task,
-        arrays that a compiled program reads out of tables by the task's number.
+        arrays that a compiled program reads out of tables by the task's number; what follows from the design is the
+        candidate's.
         """
         if not self.tasks:
-            return self
+            return self._with(candidate.own)
 
         def own(numbers: Callable[[Problem], Array | np.ndarray]) -> Array:
             table = jnp.asarray(np.stack([np.asarray(numbers(each)) for each in self.tasks]))
@@ -153,16 +154,37 @@ class Problem:
         plant = self.plant
         if names:
             table = own(lambda each: np.array([getattr(each.plant, name) for name in names]))
-            plant = eqx.tree_at(lambda plant: [getattr(plant, name) for name in names], plant, [*table])
-        return replace(self, plant=plant, start=own(lambda each: each.start), goal=own(lambda each: each.goal))
+            plant = _with_constants(plant, dict(zip(names, table, strict=True)))
+        common = replace(self, plant=plant, start=own(lambda each: each.start), goal=own(lambda each: each.goal))
+        return common._with(candidate.own)
 
-    def edited(self, design: eqx.Module) -> eqx.Module:
-        """The design as the configuration's one task changes it."""
-        if not self.config.design_edits:
-            return design
+    @property
+    def following(self) -> tuple[str, ...] | None:
+        """The robot's constants that follow from the design in one of the tasks; None where not even an end does."""
+        each = [alone.config for alone in self.tasks or (self,)]
+        if not any(config.follows_design for config in each):
+            return None
+        return tuple(dict.fromkeys(name for config in each for name in config.edits if name not in config.design))
+
+    def of_design(self, design: eqx.Module, following: tuple[str, ...] | None) -> tuple[eqx.Module, TaskNumbers | None]:
+        """The design as the configuration's one task changes it, and what else of the task follows from it: the
+        constants `following`, and the motion's ends.
+        """
         names = vars(self.plant) | vars(design)
-        edits = {name: jnp.asarray(value_of(value, names)) for name, value in self.config.design_edits.items()}
-        return type(design)(**(vars(design) | edits))
+        edits = {name: jnp.asarray(value_of(value, names)) for name, value in self.config.edits.items()}
+        fields = {name: edits.get(name, value) for name, value in vars(design).items()}
+        if following is None:
+            return type(design)(**fields), None
+        ends = self.config.ends(vars(design))
+        start, goal = (tuple(jnp.asarray(value, float) for value in end) for end in ends)
+        constants = {name: jnp.asarray(edits.get(name, names[name]), float) for name in following}
+        return type(design)(**fields), TaskNumbers(start, goal, constants)
+
+    def _with(self, own: TaskNumbers | None) -> "Problem":
+        if own is None:
+            return self
+        start, goal = (jnp.stack(jnp.broadcast_arrays(*end)) for end in (own.start, own.goal))
+        return replace(self, plant=_with_constants(self.plant, own.constants), start=start, goal=goal)
 
     @property
     def free(self) -> tuple[Variable, ...]:
@@ -196,11 +218,12 @@ def make_problem(config: Config) -> Problem:
 
 def _make_problem(config: Config, path: tuple[str, ...]) -> Problem:
     plant, task = make_plant(config.plant, config.design_units), config.task
+    start, goal = config.initial_ends
     problem = Problem(
         config=config,
         plant=plant,
-        start=np.array(config.start, float),
-        goal=np.array(task.goal, float),
+        start=np.array(start, float),
+        goal=np.array(goal, float),
         state_limits=np.array(task.state_limits, float),
         variables=tuple(_variables(config)),
         keep_out=_keep_out(config),
@@ -213,10 +236,16 @@ def _make_problem(config: Config, path: tuple[str, ...]) -> Problem:
     if problem.window is not None:
         _require_point(problem)
     if not problem.caught:
-        _require_equilibrium(problem, path)
-        _require_stabilizable(problem, path)
+        _require_equilibrium(initial(problem), path)
+        _require_stabilizable(initial(problem), path)
     _require_agreement(problem)
     return problem
+
+
+def initial(problem: Problem) -> Problem:
+    """The problem, for one task, as the design that the configuration begins with has it."""
+    _, own = _of_share(problem, 0.0, problem.following)
+    return problem._with(jax.tree.map(float, own))
 
 
 def initial_design(problem: Problem) -> eqx.Module:
@@ -260,7 +289,7 @@ def _variables(config: Config):
 
 
 def _keep_out(config: Config) -> tuple[Set, ...]:
-    ends = [end for alone in config.each.values() for end in (alone.start, alone.task.goal)]
+    ends = [end for alone in config.each.values() for end in alone.initial_ends]
     return sets_of(config.task.model_dump().get("keep_out", ()), np.array(ends))
 
 
@@ -345,8 +374,10 @@ def _require_cycle(problem: Problem) -> None:
     reset = RESETS[problem.config.task.catch.reset]
     names = list(problem.config.tasks)
     for share in (0.0, *np.random.default_rng(0).random(DESIGNS)):
-        robots = [vars(alone.plant) | vars(_design(alone, share)) for alone in problem.tasks]
-        for i, (alone, robot) in enumerate(zip(problem.tasks, robots, strict=True)):
+        designs = [_of_share(alone, share, problem.following) for alone in problem.tasks]
+        tasks = [alone._with(own) for alone, (_, own) in zip(problem.tasks, designs, strict=True)]
+        robots = [vars(alone.plant) | vars(design) for alone, (design, _) in zip(tasks, designs, strict=True)]
+        for i, (alone, robot) in enumerate(zip(tasks, robots, strict=True)):
             if missing := [name for name in reset.fields if name not in robot]:
                 text = f"needs a robot with {', '.join(reset.fields)}; there is no {', '.join(missing)}"
                 raise ConfigError([Fault(("task", "catch", "reset"), text, problem.config.task.catch.reset)])
@@ -356,7 +387,7 @@ def _require_cycle(problem: Problem) -> None:
                 if abs(float(value) - float(robots[following][name])) > SAME * abs(float(value)):
                     text = f"must be {float(value):.9g}, what it is {behind}"
                     raise ConfigError([Fault((*path, "plant", name), text, float(robots[following][name]))])
-            start, expected = problem.tasks[following].start, np.asarray(reset.state(robot, jnp.asarray(alone.goal)))
+            start, expected = tasks[following].start, np.asarray(reset.state(robot, jnp.asarray(alone.goal)))
             if np.max(np.abs(start - expected)) > AT_REST:
                 text = f"must be {expected.round(9).tolist()}, where the motion is {behind}"
                 raise ConfigError([Fault((*path, "start"), text, start.tolist())])
@@ -385,9 +416,22 @@ def _require_agreement(problem: Problem) -> None:
 
 def _design(problem: Problem, share: float) -> eqx.Module:
     """At a share of the way from the initial design to the far corner of its box."""
+    return _of_share(problem, share, problem.following)[0]
+
+
+def _of_share(
+    problem: Problem, share: float, following: tuple[str, ...] | None
+) -> tuple[eqx.Module, TaskNumbers | None]:
     fields = (variable for variable in problem.variables if variable.design)
     design = problem.plant.Design(*(jnp.asarray(v.initial + share * (_far_end(v) - v.initial)) for v in fields))
-    return problem.edited(design)
+    return problem.of_design(design, following)
+
+
+def _with_constants(plant: Plant, values: Mapping[str, Any]) -> Plant:
+    """A robot with other numbers for some of its constants, arrays as well."""
+    if not values:
+        return plant
+    return eqx.tree_at(lambda plant: [getattr(plant, name) for name in values], plant, [*values.values()])
 
 
 def _far_end(variable: Variable) -> float:

@@ -52,10 +52,18 @@ def first_failure(*statuses: Int[Array, ""]) -> Int[Array, ""]:
     return first
 
 
+class TaskNumbers(eqx.Module):
+    """What of a task follows from the design: the motion's ends, state by state, and the robot's constants by name."""
+
+    start: tuple[Float[Array, "*batch"], ...]
+    goal: tuple[Float[Array, "*batch"], ...]
+    constants: dict[str, Float[Array, "*batch"]]
+
+
 class Candidate(eqx.Module):
     """What the search chooses: the robot's design, the diagonals of the cost weights Q and R, and what it is asked to
     choose of the policy's options, by name; the others are the configuration's numbers. Of a problem with several tasks
-    a candidate is asked for one: `task` is its number.
+    a candidate is asked for one: `task` is its number. `own` is None where nothing of the task follows from the design.
     """
 
     design: eqx.Module
@@ -63,6 +71,7 @@ class Candidate(eqx.Module):
     r: Float[Array, "*batch m"]
     policy: dict[str, Float[Array, "*batch"]] = eqx.field(default_factory=dict)
     task: Int[Array, "*batch"] | None = None
+    own: TaskNumbers | None = None
 
 
 class Uncertainty(eqx.Module):

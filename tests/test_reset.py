@@ -1,7 +1,7 @@
 """Cycles of tasks: values around resets against linear algebra, and which cycles are closed."""
 
 import dataclasses
-from functools import cache
+from functools import cache, partial
 from typing import final
 
 import jax
@@ -16,7 +16,7 @@ from rtcd_jax.elite.elite import Elite
 from rtcd_jax.elite.records import mark_of, resets_in_words
 from rtcd_jax.elite.simulators import mujoco_of
 from rtcd_jax.evaluation import make_evaluate, over_tasks
-from rtcd_jax.genome import initial_genome
+from rtcd_jax.genome import decode, encode, initial_genome
 from rtcd_jax.plants import brachiation
 from rtcd_jax.problem import initial_design, make_problem
 from rtcd_jax.reset import closed, values_at_resets
@@ -27,6 +27,7 @@ from rtcd_jax.run.tasks import store_task
 from rtcd_jax.system.cluster import Cluster
 from rtcd_jax.system.errors import ConfigError, UserError
 from rtcd_jax.system.files import replace_json
+from rtcd_jax.trajectory import plan
 from rtcd_jax.types import Evaluation, Funnel, Status, Volumes
 from tests import linear_system as linear
 from tests.analysis.report.runs import run_folder
@@ -141,8 +142,8 @@ def cycle_folder(path):
     return folder
 
 
-def _changed(**sections):
-    data = resolved(load(CONFIGS / "acromonk_cycle.yaml"))
+def _changed(name="acromonk_cycle", **sections):
+    data = resolved(load(CONFIGS / f"{name}.yaml"))
     for section, keys in sections.items():
         data[section] = data.get(section, {}) | keys
     return data
@@ -200,6 +201,55 @@ def test_a_cycle_of_one_task_is_not_searched():
     del data["tasks"]["light_holds"]
     with pytest.raises(UserError, match="it needs `tasks`"):
         make_evaluate(make_problem(parse(data)))
+
+
+ARM = 0.3
+"""Of another robot than the one that was built [m]."""
+
+
+def _of_numbers():
+    """The configuration in which arithmetic of the arms' length has become its numbers."""
+    angle = float(np.arcsin(0.17 / ARM))
+    data = _changed(
+        task={"start": [-angle, 2 * angle - np.pi, 0, 0], "goal": [angle, np.pi - 2 * angle, 0, 0]},
+        design={"arm_length": {"initial": ARM, "min": ARM, "max": ARM}},
+    )
+    data["tasks"]["light_holds"]["plant"] |= {"support_center": ARM - 0.124776, "swing_center": ARM - 0.23347}
+    return make_problem(parse(data))
+
+
+def _that_follows():
+    """The problem in which they follow from the arms' length, and the genome of that length."""
+    follows = make_problem(parse(_changed("acromonk_arm")))
+    values = [ARM if variable.name == "design.arm_length" else variable.initial for variable in follows.variables]
+    return follows, jnp.asarray(encode(follows, values))
+
+
+def test_what_follows_from_the_design_is_that_of_numbers():
+    follows, genome = _that_follows()
+    for task, alone in enumerate(_of_numbers().tasks):
+        own = follows.of(decode(follows, genome, jnp.asarray(task)))
+        np.testing.assert_allclose(own.start, alone.start, atol=1e-15)
+        np.testing.assert_allclose(own.goal, alone.goal, atol=1e-15)
+        found, expected = (jax.tree.map(float, vars(each.plant)) for each in (own, alone))
+        assert found == pytest.approx(expected, abs=1e-15)
+
+
+@pytest.mark.thorough
+def test_motions_follow_the_design():
+    follows, numbers = _that_follows(), _of_numbers()
+    motions = []
+    for problem, genome in (follows, (numbers, jnp.asarray(initial_genome(numbers)))):
+        candidates = _stacked([decode(problem, genome, jnp.asarray(task)) for task in (0, 1)])
+        motions.append(jax.jit(partial(plan, problem))(candidates))
+    assert [each.status.tolist() for each in motions] == [[Status.OK] * 2] * 2
+    np.testing.assert_allclose(motions[0].xs, motions[1].xs, atol=1e-6)
+
+
+def test_a_cycle_must_be_one_for_every_design():
+    heavy = {"heavy_holds": {"goal": ["asin(0.17/arm_length)", "pi - 2*asin(0.17/0.31401)", 0, 0]}}
+    with pytest.raises(ConfigError, match=r"tasks\.light_holds\.start = .* must be .*the end of heavy_holds"):
+        make_problem(parse(_changed("acromonk_arm", tasks=heavy)))
 
 
 @pytest.mark.slow

@@ -21,7 +21,7 @@ Made from the models in `rtcd_jax/config/schema.py` by
 `python -m rtcd_jax.cli.config_page docs/config.md`. Every key is also an
 option of `rtcd optimize CONFIG`, as `--search.population 256`; with `--help` it lists them with the file's own values.
 All numbers are in SI units, angles in rad; `-` is a number without unit. In the file, those of the task and of
-variables may be arithmetic, as `2*pi` or `-pi/2`. "the paper" is Girlanda et al., ICRA 2024.
+variables may be arithmetic, as `2*pi` or `-asin(0.5)`. "the paper" is Girlanda et al., ICRA 2024.
 """
 _HEADING = "| key | unit | default | range | meaning |\n|---|---|---|---|---|"
 

@@ -109,10 +109,16 @@ def section(
         if isinstance(value, Branch):
             kind, text = Branch, field.description
         else:
-            kind, text = float if isinstance(value, float) else field.annotation, _help(field, unit)
+            kind, text = _kind(value, field), _help(field, unit)
         marked = Annotated[(kind, *field.metadata)] if field.metadata else kind
         fields.append(StructFieldSpec(name, cast(type, marked), value, text))
     return Branch(tuple(fields))
+
+
+def _kind(value: Any, field: FieldInfo) -> Any:
+    if isinstance(value, tuple) and any(isinstance(each, str) for each in value):
+        return tuple[float | str, ...]  # the ends of a motion, which may be arithmetic
+    return float if isinstance(value, float) else field.annotation
 
 
 def _help(field: FieldInfo, unit: str) -> str:

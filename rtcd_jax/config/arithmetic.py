@@ -1,4 +1,4 @@
-"""Numbers written as arithmetic, such as `2*pi/3`: names, numbers, + - * / ** and parentheses, nothing else."""
+"""Numbers written as arithmetic, such as `2*pi/3`: names, numbers, + - * / **, parentheses and a few functions."""
 
 import ast
 import functools
@@ -15,7 +15,9 @@ _OPERATIONS: dict[type, Callable[..., Any]] = {
     ast.Pow: operator.pow, ast.USub: operator.neg, ast.UAdd: operator.pos,
 }  # fmt: skip
 
-_ALLOWED = "must be a number, or numbers and names with + - * / ** and parentheses"
+FUNCTIONS = ("sin", "cos", "tan", "asin", "acos", "atan", "sqrt")
+
+_ALLOWED = f"must be a number, or numbers and names with + - * / **, parentheses and {', '.join(FUNCTIONS)}"
 
 
 def arithmetic(text: str, names: Mapping[str, float]) -> float:
@@ -31,7 +33,7 @@ def arithmetic(text: str, names: Mapping[str, float]) -> float:
         value = evaluate(text, names)
     except TypeError:
         raise ValueError(f"is no arithmetic: {_ALLOWED}") from None
-    except (ZeroDivisionError, OverflowError):
+    except (ZeroDivisionError, OverflowError, ValueError):
         value = math.nan
     if isinstance(value, complex) or not math.isfinite(value):
         raise ValueError("has no finite value")
@@ -45,6 +47,11 @@ def names_of(text: str) -> tuple[str, ...]:
         ValueError: it is no arithmetic.
     """
     return _names(_parsed(text))
+
+
+def calls_functions(text: str) -> bool:
+    """Whether `text`, which is arithmetic, is more than a rational function of its names."""
+    return any(isinstance(node, ast.Call) for node in ast.walk(_parsed(text)))
 
 
 def evaluate(text: str, names: Mapping[str, Any]) -> Any:
@@ -74,6 +81,8 @@ def _names(node: ast.expr) -> tuple[str, ...]:
             return tuple(dict.fromkeys((*_names(left), *_names(right))))
         case ast.UnaryOp(operation, operand) if type(operation) in _OPERATIONS:
             return _names(operand)
+        case ast.Call(ast.Name(name), [argument], []) if name in FUNCTIONS:
+            return _names(argument)
     raise ValueError(f"is no arithmetic: {_ALLOWED}")
 
 
@@ -89,4 +98,8 @@ def _value(node: ast.expr, names: Mapping[str, Any]) -> Any:
             return _OPERATIONS[type(operation)](_value(left, names), _value(right, names))
         case ast.UnaryOp(operation, operand):
             return _OPERATIONS[type(operation)](_value(operand, names))
+        case ast.Call(ast.Name(name), [argument], []):
+            value = _value(argument, names)
+            library = value.__array_namespace__() if hasattr(value, "__array_namespace__") else math
+            return getattr(library, name)(value)
     raise TypeError(node)

@@ -5,9 +5,10 @@
 
 import hashlib
 import inspect
+import itertools
 import json
 import re
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -27,7 +28,7 @@ from pydantic import (
 from rtcd_jax.config import mjcf, yaml12
 from rtcd_jax.config.arithmetic import arithmetic
 from rtcd_jax.config.plants import PackagedPlant, PlantConfig, read_plant
-from rtcd_jax.config.robot import Value, needs
+from rtcd_jax.config.robot import Value, needs, value_of
 from rtcd_jax.config.schema import (
     CheckpointConfig,
     ElitesConfig,
@@ -123,19 +124,30 @@ class Config(Settings):
 
     def of_task(self, name: str) -> "Config":
         """That of one of its `tasks`: start, goal and the plant's constants are in their sections, `tasks` keeps it and
-        what it changes of the design.
+        what it changes of the design, and of the constants if one of them follows from the design.
         """
         changes, known = self.tasks[name], self.plant.values()
         ends = {key: getattr(changes, key) for key in ("start", "goal") if getattr(changes, key)}
-        constants = {key: _number(value, known) for key, value in changes.plant.items() if key in known}
-        design = {key: value for key, value in changes.plant.items() if key not in known}
-        update = {"task": self.task.model_copy(update=ends), "tasks": {name: TaskChanges(plant=design)}}
-        return self.model_copy(update=update | ({"plant": self.plant.edited(constants)} if constants else {}))
+        constants = {key: value for key, value in changes.plant.items() if key in known}
+        if any(other in self.design for value in constants.values() for other in needs(value)):
+            constants = {}
+        kept = {key: value for key, value in changes.plant.items() if key not in constants}
+        update: dict[str, Any] = {"task": self.task.model_copy(update=ends), "tasks": {name: TaskChanges(plant=kept)}}
+        if constants:
+            numbers = {key: _number(value, known) for key, value in constants.items()}
+            update["plant"] = self.plant.edited(numbers)
+        return self.model_copy(update=update)
 
     @property
-    def design_edits(self) -> Mapping[str, Value]:
-        """Numbers or arithmetic that the only one of its tasks has in the place of design fields."""
+    def edits(self) -> Mapping[str, Value]:
+        """Numbers or arithmetic that the only one of its tasks has in the place of design fields and constants."""
         return next(iter(self.tasks.values())).plant if len(self.tasks) == 1 else {}
+
+    @property
+    def follows_design(self) -> bool:
+        """Whether the ends of its motion, or constants of its one task, are arithmetic of the design."""
+        ends = any(isinstance(value, str) for state in (self.task.start, self.task.goal) for value in state)
+        return ends or any(name not in self.design for name in self.edits)
 
     @property
     def design_units(self) -> dict[str, str]:
@@ -155,10 +167,17 @@ class Config(Settings):
         """Whether the motion is rest at the goal: its region is all that is searched for."""
         return self.search.objective == GOAL
 
+    def ends(self, design: Mapping[str, Any]) -> tuple[tuple, tuple]:
+        """First and last state of the nominal motion, of these designs by name; both are the goal where no motion is
+        asked for.
+        """
+        first = self.task.goal if self.at_rest else self.task.start
+        return _placed(first, design), _placed(self.task.goal, design)
+
     @property
-    def start(self) -> tuple[float, ...]:
-        """The first state of the nominal motion: the goal where no motion is asked for."""
-        return self.task.goal if self.at_rest else self.task.start
+    def initial_ends(self) -> tuple[tuple[float, ...], tuple[float, ...]]:
+        """Those of the initial design."""
+        return self.ends({name: variable.initial for name, variable in self.design.items()})
 
     def logarithmic(self, key: str) -> bool:
         """Whether the search scales the variable of this dotted key logarithmically."""
@@ -189,8 +208,48 @@ def _size(path: tuple[str | int, ...], values: tuple, names: Collection[str]) ->
         yield Problem(path, f"must have {len(names)} {plural} ({', '.join(names)}), has {len(values)}")
 
 
-def _ends(task: TaskConfig, trajectory: TrajectoryConfig) -> Iterator[Problem]:
-    share = trajectory.limit_share
+def _placed(state: Sequence[Value], design: Mapping[str, Any]) -> tuple:
+    return tuple(value_of(value, design) for value in state)
+
+
+def _ends(task: TaskConfig, trajectory: TrajectoryConfig, design: dict[str, Variable]) -> Iterator[Problem]:
+    """Of the initial design, and at the corners of the boxes of the designs that the ends name."""
+    used: dict[str, Variable] = {}
+    for key in ("start", "goal"):
+        for i, value in enumerate(getattr(task, key)):
+            for name in needs(value):
+                if name not in design:
+                    yield Problem(("task", key, i), f"names {name}; there is {', '.join(('pi', *design))}", value)
+                    return
+                used[name] = design[name]
+            if isinstance(value, str) and key == "goal" and not task.caught:
+                yield Problem(
+                    ("task", key, i), "must be a number: only with task.catch a goal follows the design", value
+                )
+                return
+    boxes = ((variable.min, variable.max) if variable.free else (variable.initial,) for variable in used.values())
+    for corner in ([variable.initial for variable in used.values()], *itertools.product(*boxes)):
+        names = dict(zip(used, corner, strict=True))
+        found = list(_ends_at(task, trajectory, names))
+        if found:
+            where = ", ".join(f"{name} = {value:g}" for name, value in names.items())
+            yield from (each._replace(text=f"{each.text}, at {where}") if used else each for each in found)
+            return
+
+
+def _ends_at(task: TaskConfig, trajectory: TrajectoryConfig, names: Mapping[str, float]) -> Iterator[Problem]:
+    """Of designs with these numbers."""
+    ends: dict[str, tuple[float, ...]] = {}
+    for key in ("start", "goal"):
+        numbers = []
+        for i, value in enumerate(getattr(task, key)):
+            try:
+                numbers.append(_number(value, names))
+            except ValueError as error:
+                yield Problem(("task", key, i), str(error), value)
+                return
+        ends[key] = tuple(numbers)
+    task, share = task.model_copy(update=ends), trajectory.limit_share
     for key in ("start", "goal"):
         for i, (value, limit) in enumerate(zip(getattr(task, key), task.state_limits, strict=False)):
             if abs(value) >= limit:
@@ -260,7 +319,7 @@ def _tasks(
         for key, value in own.items():
             yield from _size((*path, key), value, plant.states)
         if own:
-            ends = (fault for fault in _ends(whole, trajectory) if fault.path[1] in own)
+            ends = (fault for fault in _ends(whole, trajectory, design) if fault.path[1] in own)
             yield from (fault._replace(path=(*path, *fault.path[1:])) for fault in ends)
             yield from (fault._replace(path=(*path, *fault.path[1:])) for fault in _motion(whole, search))
         yield from (fault._replace(path=(*path, "plant", *fault.path)) for fault in _edits(plant, design, changes))
@@ -272,10 +331,11 @@ def _edits(plant: PlantConfig, design: dict[str, Variable], changes: TaskChanges
     """What is wrong with a task's changes of the robot."""
     known, constants = plant.values(), {}
     names = tuple(dict.fromkeys((*known, *design)))
+    designs = [{name: getattr(each, at) for name, each in design.items()} for at in ("initial", "min", "max")]
     for key, value in changes.plant.items():
         if key in known:
             try:
-                constants[key] = _number(value, known)
+                constants[key] = [_number(value, known | numbers) for numbers in designs]
             except ValueError as error:
                 yield Problem((key,), str(error), value)
         elif key in design:
@@ -286,10 +346,12 @@ def _edits(plant: PlantConfig, design: dict[str, Variable], changes: TaskChanges
             yield Problem((key,), "is the same in all tasks: only numbers and design fields may differ", value)
         else:
             yield Problem((key,), f"must be a constant or a design field of {plant.name}; {closest(key, names)}", value)
-    try:
-        plant.edited(constants)
-    except ValidationError as error:
-        yield from (fault._replace(path=fault.path[-1:]) for fault in problems_of(error))
+    for i in range(len(designs)):
+        try:
+            plant.edited({key: each[i] for key, each in constants.items()})
+        except ValidationError as error:
+            yield from (fault._replace(path=fault.path[-1:]) for fault in problems_of(error))
+            return
 
 
 def _number(value: Value, names: Mapping[str, float]) -> float:

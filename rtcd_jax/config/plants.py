@@ -12,6 +12,7 @@ from typing import Annotated, Any, ClassVar, Literal, Self, cast
 from pydantic import BeforeValidator, Field, PlainSerializer, PlainValidator, ValidationError, create_model
 
 from rtcd_jax.config import yaml12
+from rtcd_jax.config.arithmetic import calls_functions
 from rtcd_jax.config.mjcf import Names, NotMjcf, read_names
 from rtcd_jax.config.robot import Edit, Named, Robot, Value, needs, parameter, read_edits, resolved_order
 from rtcd_jax.config.settings import Settings, invalid, problems_of, refusal
@@ -102,6 +103,8 @@ def _value(value: Any) -> Value:
             needs(value)
         except ValueError as error:
             raise refusal(str(error)) from None
+        if calls_functions(value):
+            raise refusal("must be numbers and names with + - * / ** and parentheses: functions are for a task's ends")
         return value
     if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) <= LARGEST:
         raise refusal(f"must be a number within +- {LARGEST:g}, or arithmetic")

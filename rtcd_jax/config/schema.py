@@ -13,14 +13,17 @@ from pydantic import (
     BeforeValidator,
     Field,
     GetCoreSchemaHandler,
+    PlainSerializer,
     SerializeAsAny,
     SerializerFunctionWrapHandler,
+    ValidatorFunctionWrapHandler,
+    WrapValidator,
     field_validator,
     model_serializer,
 )
 from pydantic_core.core_schema import CoreSchema, no_info_plain_validator_function
 
-from rtcd_jax.config.arithmetic import arithmetic
+from rtcd_jax.config.arithmetic import arithmetic, names_of
 from rtcd_jax.config.plants import Number as Arithmetic
 from rtcd_jax.config.plants import PlantConfig
 from rtcd_jax.config.settings import Settings, invalid, refusal
@@ -42,6 +45,18 @@ def _number(value: Any) -> Any:
         return arithmetic(value, {})
     except ValueError as error:
         raise refusal(str(error)) from None
+
+
+def _of_names(value: Any, number: ValidatorFunctionWrapHandler) -> Any:
+    """Arithmetic of names as it stands, all else by `number`."""
+    with contextlib.suppress(ValueError):
+        if isinstance(value, str) and names_of(value):
+            return value
+    return number(value)
+
+
+def _as_it_is(value: Any) -> Any:
+    return value
 
 
 ARITHMETIC = BeforeValidator(_number)
@@ -76,6 +91,13 @@ class Variable(Settings):
 
 # Strictness is for the numbers: YAML's lists become tuples.
 Numbers = Annotated[tuple[Annotated[float, Field(ge=-1e6, le=1e6), ARITHMETIC], ...], Field(strict=False)]
+Ends = Annotated[
+    tuple[
+        Annotated[float, Field(ge=-1e6, le=1e6), ARITHMETIC, WrapValidator(_of_names), PlainSerializer(_as_it_is)], ...
+    ],
+    Field(strict=False),
+]
+"""A state whose numbers may be arithmetic of the design, and are then kept as text."""
 Limits = Annotated[tuple[Annotated[float, Field(ge=1e-6, allow_inf_nan=True), ARITHMETIC], ...], Field(strict=False)]
 Widths = Annotated[tuple[Annotated[float, Field(ge=1e-6, le=1e6), ARITHMETIC], ...], Field(strict=False)]
 LARGEST_LIMIT = 1e6
@@ -197,9 +219,12 @@ class CatchConfig(Settings):
 
 
 class TaskConfig(Settings):
-    start: Numbers = Field(description=f"first state of the nominal motion, pinned [{UNIT}]")
-    goal: Numbers = Field(
-        description=f"last state of the nominal motion, pinned, an equilibrium unless there is a `catch` [{UNIT}]"
+    start: Ends = Field(
+        description=f"first state of the nominal motion, pinned; may be arithmetic of the design [{UNIT}]"
+    )
+    goal: Ends = Field(
+        description="last state of the nominal motion, pinned, an equilibrium unless there is a `catch`, with which it "
+        f"may be arithmetic of the design [{UNIT}]"
     )
     state_limits: Limits = Field(
         description=f"largest |x_i|, at most 1e6, or .inf for none; leaving them is a failure [{UNIT}]"
@@ -233,8 +258,8 @@ class TaskConfig(Settings):
 class TaskChanges(Settings):
     """One of several tasks: what it has of its own; all else is as `task` says."""
 
-    start: Numbers = Field(default=(), description=f"its first state; empty: that of `task` [{UNIT}]")
-    goal: Numbers = Field(default=(), description=f"its last state, as that of `task`; empty: the same [{UNIT}]")
+    start: Ends = Field(default=(), description=f"its first state; empty: that of `task` [{UNIT}]")
+    goal: Ends = Field(default=(), description=f"its last state, as that of `task`; empty: the same [{UNIT}]")
     plant: dict[str, Arithmetic] = Field(
         default={},
         description="constants and design fields that differ in it: numbers, or arithmetic [their units]",

@@ -8,7 +8,7 @@ import numpy as np
 
 from rtcd_jax.plants.mjcf import closed_form
 from rtcd_jax.plants.robot import MjcfPlant
-from rtcd_jax.problem import AT_REST, Problem, initial_design, linearized_goal
+from rtcd_jax.problem import AT_REST, Problem, initial, initial_design, linearized_goal
 
 
 def understood(problem: Problem) -> Iterator[str]:
@@ -20,6 +20,7 @@ def understood(problem: Problem) -> Iterator[str]:
             yield f"task       {name}"
             yield from understood(alone)
         return
+    problem = initial(problem)
     plant, design = problem.plant, initial_design(problem)
     yield f"robot      {problem.config.plant.name}: {plant.convention}"
     bounds = zip(plant.state_names, plant.state_units, problem.state_limits, strict=True)

@@ -25,7 +25,7 @@ from rtcd_jax.window import farthest
 
 def arrays_of(problem: Problem, evaluation: Evaluation) -> dict[str, np.ndarray]:
     """The numbers of one candidate (no leading axis), SI units; knots first."""
-    host = jax.tree.map(np.asarray, evaluation)
+    problem, host = problem.of(evaluation.candidate), jax.tree.map(np.asarray, evaluation)
     policy, volumes = host.funnel.policy, host.volumes
     knots = len(policy.trajectory.xs)
     rates = {} if policy.value_rates is None else {"S_rates": policy.value_rates}
@@ -84,7 +84,7 @@ def record_of(
     `others` are its evaluations under other keys, `physics` is MJX beside the closed form, `refinement` says what was
     refined, and the volumes before.
     """
-    budget = elite_budget(problem)
+    problem, budget = problem.of(evaluation.candidate), elite_budget(problem)
     host = jax.tree.map(np.asarray, evaluation)
     plant, config = problem.plant, problem.config
     funnel, volumes = host.funnel, host.volumes
@@ -213,7 +213,7 @@ def _keep_out(config: Config) -> list[dict[str, Any]]:
 
 def _searched_design(problem: Problem, evaluation: Evaluation) -> eqx.Module:
     """The design that the search chose, without what the task changes of it."""
-    if not problem.config.design_edits:
+    if not problem.config.edits:
         return evaluation.candidate.design
     unchanged = replace(problem, config=problem.config.model_copy(update={"tasks": {}}))
     return decode(unchanged, jnp.asarray(evaluation.genome)).design

@@ -11,7 +11,16 @@ from rtcd_jax.system.errors import ConfigError
 
 @pytest.mark.parametrize(
     ("text", "value"),
-    [("pi", math.pi), ("-pi/2", -math.pi / 2), ("2 * (1 + half)**2", 4.5), ("1e-3", 1e-3), ("+2**-1", 0.5), (" 3 ", 3)],
+    [
+        ("pi", math.pi),
+        ("-pi/2", -math.pi / 2),
+        ("2 * (1 + half)**2", 4.5),
+        ("1e-3", 1e-3),
+        ("+2**-1", 0.5),
+        (" 3 ", 3),
+        ("asin(half)", math.asin(0.5)),
+        ("-sqrt(cos(0)**2 + 3)*half", -1.0),
+    ],
 )
 def test_arithmetic_has_its_value(text, value):
     assert arithmetic(text, {"half": 0.5}) == value
@@ -22,6 +31,9 @@ def test_arithmetic_has_its_value(text, value):
     [
         ("two*pi", r"names two; there is pi, half"),
         ("1/0", r"has no finite value"),
+        ("acos(4*half)", r"has no finite value"),
+        ("sin(1, 2)", r"is no arithmetic"),
+        ("sin", r"names sin; there is pi, half"),
         ("9e9**9e9", r"has no finite value"),
         ("(-1)**half", r"has no finite value"),
         ("1e999", r"has no finite value"),
@@ -58,4 +70,4 @@ def test_wrong_arithmetic_is_told_at_its_key():
         parse_yaml(EXAMPLE.replace("goal: [3.141592653589793", "goal: [po"))
     (problem,) = caught.value.problems
     assert problem.path == ("task", "goal", 0)
-    assert str(caught.value).splitlines()[-1].endswith("names po; there is pi")
+    assert str(caught.value).splitlines()[-1].endswith("names po; there is pi, mass, length")

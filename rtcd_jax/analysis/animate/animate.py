@@ -116,7 +116,6 @@ def _columns(folder: Path, config: Config, seed: int, console: Console) -> list[
     if absence:
         console.message(f"{absence}: the best elite is shown alone")
     disturbed = disturbed_start(elites["best"], seed)
-    starts = np.stack([np.array(config.start), disturbed])
     time = frame_times(list(elites.values()), HOLD, RATE)
     console.message(
         "disturbed start, from the best funnel's first ellipsoid: "
@@ -124,6 +123,7 @@ def _columns(folder: Path, config: Config, seed: int, console: Console) -> list[
     )
     columns = []
     for label, elite in elites.items():
+        starts = np.stack([elite.x[0], disturbed])
         model, f = dynamics_before_mujoco(elite, len(starts))
         columns.append(Column(label, model, motions(FunnelInterpolant.of(elite), f, starts, time)))
     return columns

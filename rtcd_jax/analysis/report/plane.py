@@ -79,9 +79,8 @@ def plane_of(
         measured = motion[:, pair]
         window = np.stack([np.minimum(window[0], measured.min(0)), np.maximum(window[1], measured.max(0))])
     states = list(config.plant.states.items())
-    limits, start, goal = (
-        [values[i] for i in pair] for values in (config.task.state_limits, config.start, config.task.goal)
-    )
+    best = funnels[-1].elite
+    limits, start, goal = ([values[i] for i in pair] for values in (config.task.state_limits, best.x[0], best.x_goal))
     shown = (_polygon(each, pair, window) for each in config.task.keep_out)
     kept_out = [polygon for polygon in shown if polygon is not None and len(polygon)]
     return Plane([states[i] for i in pair], limits, window, shadows, start, goal, kept_out)
