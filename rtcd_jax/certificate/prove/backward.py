@@ -8,7 +8,7 @@ more than it needs, the interval is proved once more with a lower decay margin.
 
 import itertools
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from functools import cache
 from typing import Any, NamedTuple, cast, final
 
@@ -88,6 +88,8 @@ HIGHEST_DEGREE = 3
 """In each of a robot's numbers about own motions: a number has one control point more."""
 ENOUGH_OF_DEGREES = 1.25
 """Times the error of the models: higher degrees do not help then."""
+FROM_THE_CHEAPEST = 8
+"""Knots after which programs begin with the cheapest again, instead of with those that were enough before."""
 ERROR_FRACTION = 1 / 3
 """A Taylor model is good enough if its error is at most this fraction of the decay margin."""
 
@@ -141,7 +143,8 @@ class Proved(NamedTuple):
 class ProofState(NamedTuple):
     """How far the proof has come: a fraction of an interval, the level and the ellipsoid there.
 
-    `first_margin` [1/s] is the decay margin that the next interval begins with, and `length` its fraction.
+    `first_margin` [1/s] is the decay margin that the next interval begins with, and `length` its fraction; `sizes` of
+    the squares' monomials, by case, were enough for the last one.
     """
 
     knot: int
@@ -150,6 +153,7 @@ class ProofState(NamedTuple):
     axes: list
     first_margin: float
     length: float
+    sizes: Mapping[str, tuple[int, int]]
 
 
 @final
@@ -164,7 +168,7 @@ class BackwardProof:
     def outlet(self, rho: float) -> ProofState:
         """The state at which the proof begins: t_N with the level rho."""
         last = len(self.loop.u) - 1
-        return ProofState(last, 1.0, rho, on_grid(self.loop.axes(last, 1.0, rho, 0.0)[0]), self._rates[0], 1.0)
+        return ProofState(last, 1.0, rho, on_grid(self.loop.axes(last, 1.0, rho, 0.0)[0]), self._rates[0], 1.0, {})
 
     def intervals_from(self, state: ProofState) -> Iterator[Proved]:
         """The proved intervals from the state back to t = 0, or to where nothing can be proved."""
@@ -185,7 +189,8 @@ class BackwardProof:
         k, start, length = proved.interval.knot, float(proved.interval.start), proved.length
         longer = min(1.0, 2 * length) if proved.decay_margin <= LOW * LARGEST[self.claim.n] else length
         first_margin = min(self._lowered(proved.decay_margin, proved.margin), LARGEST[self.claim.n] / longer)
-        return ProofState(k, start, proved.rho, proved.interval.first, first_margin, longer)
+        sizes = {case: size_of(each) for case, each in proved.interval.cases.items()}
+        return ProofState(k, start, proved.rho, proved.interval.first, first_margin, longer, sizes)
 
     def _lowered(self, decay_margin: float, margin: float) -> float:
         """A decay margin that the certificates' margin still allows, if that is much; the same if not."""
@@ -213,6 +218,8 @@ class BackwardProof:
             if self.claim.first_order:
                 check.require_jump(self.claim, interval, "jumps")
             interval, todo, shapes = self._models(interval, decay_margin)
+            if self.claim.shifts and k % FROM_THE_CHEAPEST:  # of their many programs
+                shapes = {case: _from(each, state.sizes.get(case, (0, 0))) for case, each in shapes.items()}
             proof = prove(todo, shapes, decay_margin, self.exact, self._directions, self.solver)
         except Refused:
             return None
@@ -255,6 +262,16 @@ class BackwardProof:
             if max(float(each.error) for each in todo.values()) <= max(allowed, ENOUGH_OF_DEGREES * own):
                 break
         return interval, todo, tier.shapes(todo, self.loop, FEWEST)
+
+
+def size_of(squares: GramCertificate | Shape) -> tuple[int, int]:
+    """Degree of the monomials, and how many there are beyond it."""
+    return squares.degree, len(squares.further)
+
+
+def _from(shapes: list[Shape], size: tuple[int, int]) -> list[Shape]:
+    """Without those that are smaller, which were not enough before; the last one at least."""
+    return [shape for shape in shapes if size_of(shape) >= size] or shapes[-1:]
 
 
 def prove(
