@@ -11,6 +11,7 @@ from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
 from multiprocessing.connection import wait
 from multiprocessing.context import SpawnContext, SpawnProcess
+from multiprocessing.queues import Queue
 from threading import Thread
 from typing import Any
 
@@ -25,21 +26,33 @@ class _Worker(SpawnProcess):
             signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
+_TIDY = "ignore:resource_tracker:UserWarning"
+
+
+def _leave_tidying() -> None:
+    """multiprocessing's own tidying process, which the first queue or pool begins, would count on stderr what a process
+    that leaves at once has left to it.
+    """
+    warnings = os.environ.get("PYTHONWARNINGS", "")
+    if _TIDY not in warnings:
+        os.environ["PYTHONWARNINGS"] = f"{warnings},{_TIDY}".lstrip(",")
+
+
 class _Context(SpawnContext):
     Process = _Worker
 
+    def Queue(self, maxsize: int = 0) -> Queue:
+        _leave_tidying()
+        return super().Queue(maxsize)
+
 
 CONTEXT = _Context()
-_TIDY = "ignore:resource_tracker:UserWarning"
 
 
 @contextmanager
 def processes(count: int, prepare: Callable[..., None] | None = None, *arguments: Any) -> Iterator[ProcessPoolExecutor]:
     """`count` processes, each of which first calls `prepare(*arguments)`; at the end, tasks that wait are dropped."""
-    # multiprocessing's own tidying process would count on stderr what a process that leaves at once has left to it.
-    warnings = os.environ.get("PYTHONWARNINGS", "")
-    if _TIDY not in warnings:
-        os.environ["PYTHONWARNINGS"] = f"{warnings},{_TIDY}".lstrip(",")
+    _leave_tidying()
     with ProcessPoolExecutor(count, CONTEXT, _begin, (prepare, *arguments)) as pool:
         try:
             yield pool

@@ -47,6 +47,12 @@ def test_workers_end_with_a_killed_parent(sign):
         assert not any(map(runs, workers))
 
 
+def test_a_process_that_leaves_at_once_leaves_no_word_of_its_queues():
+    leaves = "import os; from rtcd_jax.system.processes import CONTEXT; steps = CONTEXT.Queue(); os._exit(85)"
+    done = subprocess.run([sys.executable, "-c", leaves], capture_output=True, text=True)
+    assert (done.returncode, done.stdout, done.stderr) == (85, "", "")
+
+
 def test_every_worker_is_prepared():
     with processes(2, os.putenv, "RTCD_PREPARED", "1") as pool:
         assert list(pool.map(abs, [-1, 2])) == [1, 2]
