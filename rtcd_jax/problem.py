@@ -38,9 +38,12 @@ SAME = 1e-9
 
 
 class Reset(NamedTuple):
-    """The numbers of a robot that it needs; what becomes of them, and of the state [n *batch]."""
+    """The numbers of a robot that it needs, and which of them change places; what becomes of them, and of the state
+    [n *batch].
+    """
 
     fields: tuple[str, ...]
+    pairs: tuple[tuple[str, str], ...]
     numbers: Callable[..., dict[str, Any]]
     state: Callable[..., Array]
 
@@ -66,7 +69,7 @@ class Window(NamedTuple):
     speed: float
 
 
-RESETS = {"brachiation": Reset(brachiation.FIELDS, brachiation.exchanged, brachiation.catch)}
+RESETS = {"brachiation": Reset(brachiation.FIELDS, brachiation.PAIRS, brachiation.exchanged, brachiation.catch)}
 """By the name in the configuration."""
 
 
@@ -372,6 +375,7 @@ def _require_stabilizable(problem: Problem, path: tuple[str, ...]) -> None:
 def _require_cycle(problem: Problem) -> None:
     """Every task's end and robot after the reset must be the start and the robot of the next one, of all designs."""
     reset = RESETS[problem.config.task.catch.reset]
+    _require_exchangeable(problem.config, reset)
     names = list(problem.config.tasks)
     for share in (0.0, *np.random.default_rng(0).random(DESIGNS)):
         designs = [_of_share(alone, share, problem.following) for alone in problem.tasks]
@@ -391,6 +395,21 @@ def _require_cycle(problem: Problem) -> None:
             if np.max(np.abs(start - expected)) > AT_REST:
                 text = f"must be {expected.round(9).tolist()}, where the motion is {behind}"
                 raise ConfigError([Fault((*path, "start"), text, start.tolist())])
+
+
+def _require_exchangeable(config: Config, reset: Reset) -> None:
+    """Raises ConfigError unless the robots of the box are the same after the reset."""
+    partners = {name: other for pair in reset.pairs for name, other in (pair, pair[::-1])}
+    box = config.uncertainty
+    for section in ("design", "plant"):
+        for name, width in getattr(box, section).items():
+            path = ("uncertainty", section, name)
+            if name in reset.fields and width and name not in partners:
+                text = "must be 0 with task.catch.reset: after a reset it is another number of the robot"
+                raise ConfigError([Fault(path, text, width)])
+            if name in partners and width != (expected := (box.design | box.plant).get(partners[name], 0.0)):
+                text = f"must be that of {partners[name]}, which is {expected:g}: at a reset they change places"
+                raise ConfigError([Fault(path, text, width)])
 
 
 def _quarter_turns(count: int) -> str:

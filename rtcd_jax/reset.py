@@ -8,6 +8,7 @@ from swing to swing.
 """
 
 import dataclasses
+import itertools
 from functools import partial
 
 import jax
@@ -15,12 +16,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
+from rtcd_jax.adversary import Scales
 from rtcd_jax.numerics import riccati, sampling
 from rtcd_jax.numerics.batched import mm, mtm
 from rtcd_jax.numerics.derivatives import jacobian
 from rtcd_jax.numerics.ellipsoid import Ellipsoids
 from rtcd_jax.policy import riccati_intervals
-from rtcd_jax.problem import Problem
+from rtcd_jax.problem import RESETS, Problem
 from rtcd_jax.types import Candidate, Evaluation, Status, TaskEvaluations, Trajectory, first_failure
 
 
@@ -34,7 +36,7 @@ def values_at_resets(problem: Problem, candidates: Candidate, trajectories: Traj
         stages = riccati_intervals(own, candidate, trajectory)
         last, others = jax.tree.map(lambda leaf: leaf[-1], stages), jax.tree.map(lambda leaf: leaf[:-1], stages)
         whole, _ = jax.lax.scan(lambda late, early: (riccati.compose(early, late), None), last, others, reverse=True)
-        return whole, jacobian(partial(_reset, problem, candidate), trajectory.xs[-1])
+        return whole, jacobian(partial(_reset, problem, candidate, {}), trajectory.xs[-1])
 
     swings, jumps = jax.vmap(swing)(candidates, trajectories)
     jumped = jax.vmap(riccati.mapped)(swings, jumps)
@@ -68,7 +70,7 @@ def worst_after_reset(
 ) -> tuple[Float[Array, " tasks"], Float[Array, "tasks 2 n"]]:
     """Of one genome's evaluations [T]: the largest V / rho_0 in the next task's first ellipsoid, at most 1 if the cycle
     is closed there, of `samples` states that are uniform in each last one, and as many on its rim, after the reset; and
-    the states before and after the reset that have it.
+    the states before and after the reset that have it. Under uncertainty of the worst robot at a corner of the box.
     """
     policies = tasks.funnel.policy
     count, _, n = policies.trajectory.xs.shape
@@ -80,14 +82,35 @@ def worst_after_reset(
     y = jnp.concatenate([y, y / jnp.sqrt(jnp.sum(y**2, 0))], -1)
     radii = jnp.sqrt(tasks.funnel.levels[:, -1])[:, None]
     ends = sets(-1).points(jnp.broadcast_to(radii, y.shape[1:]), y)
-    after = jax.vmap(partial(_reset, problem), (0, 1), 1)(tasks.candidate, ends)
-    levels = sets(0).level(jnp.roll(after, 1, 1)) / tasks.funnel.levels[:, 0][:, None]
-    levels = jnp.roll(jnp.where(jnp.isnan(levels), jnp.inf, levels), -1, 0)
-    states = jnp.moveaxis(jnp.stack([ends, after]), (2, 3), (0, 1))  # [tasks samples 2 n]
-    return jnp.max(levels, -1), states[np.arange(count), jnp.argmax(levels, -1)]
+
+    def of_the_robot(scales: Scales):
+        after = jax.vmap(lambda candidate, x: _reset(problem, candidate, scales, x), (0, 1), 1)(tasks.candidate, ends)
+        levels = sets(0).level(jnp.roll(after, 1, 1)) / tasks.funnel.levels[:, 0][:, None]
+        levels = jnp.roll(jnp.where(jnp.isnan(levels), jnp.inf, levels), -1, 0)
+        states = jnp.moveaxis(jnp.stack([ends, after]), (2, 3), (0, 1))  # [tasks samples 2 n]
+        return jnp.max(levels, -1), states[np.arange(count), jnp.argmax(levels, -1)]
+
+    robots = _corners(problem)
+    if not robots:
+        return of_the_robot({})
+    levels, states = jax.lax.map(of_the_robot, robots)
+    worst = jnp.argmax(levels, 0)
+    return jnp.max(levels, 0), states[worst, np.arange(count)]
 
 
-def _reset(problem: Problem, candidate: Candidate, x: Float[Array, "n *batch"]) -> Float[Array, "n *batch"]:
-    """R of states at the end of the candidate's task, with its robot's numbers."""
+def _corners(problem: Problem) -> Scales:
+    """Of the box of robots by the numbers that the reset needs, and the nominal one [R]; empty without such a box."""
+    box = problem.uncertainty
+    fields = RESETS[problem.config.task.catch.reset].fields if box is not None else ()
+    widths = {name: width for name, width in (box.parameters if box else {}).items() if name in fields}
+    signs = np.array([*itertools.product((-1.0, 1.0), repeat=len(widths)), np.zeros(len(widths))])
+    return {name: 1 + width * side for (name, width), side in zip(widths.items(), signs.T, strict=True)}
+
+
+def _reset(
+    problem: Problem, candidate: Candidate, scales: Scales, x: Float[Array, "n *batch"]
+) -> Float[Array, "n *batch"]:
+    """R of states at the end of the candidate's task, with its robot's numbers, some of them scaled."""
     assert problem.reset is not None
-    return problem.reset(vars(problem.of(candidate).plant) | vars(candidate.design), x)
+    numbers = problem.numbers(candidate)
+    return problem.reset(numbers | {name: numbers[name] * scale for name, scale in scales.items()}, x)

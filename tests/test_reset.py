@@ -19,7 +19,7 @@ from rtcd_jax.evaluation import make_evaluate, over_tasks
 from rtcd_jax.genome import decode, encode, initial_genome
 from rtcd_jax.plants import brachiation
 from rtcd_jax.problem import initial_design, make_problem
-from rtcd_jax.reset import closed, values_at_resets
+from rtcd_jax.reset import closed, values_at_resets, worst_after_reset
 from rtcd_jax.run.format import arrays_of, common_arrays, common_record, record_of
 from rtcd_jax.run.optimize import optimize
 from rtcd_jax.run.reevaluation import row
@@ -171,7 +171,18 @@ WRONG = {
         {"task": {"catch": {"reset": "brachiation", "half_widths": [1, 1, 1, 1]}}},
         r"task\.catch\.reset = 'brachiation': must be left away where there are half_widths",
     ),
-    "an uncertain robot": ({"uncertainty": {"input": 0.1}}, r"uncertainty: must be empty with task\.catch\.reset"),
+    "own motions": (
+        {"uncertainty": {"design": {"swing_mass": 0.1}, "center": "moving"}},
+        r"uncertainty\.center = 'moving': must be common with task\.catch\.reset",
+    ),
+    "an arm that is uncertain": (
+        {"uncertainty": {"design": {"support_mass": 0.1, "swing_mass": 0.05}}},
+        r"uncertainty\.design\.support_mass = 0\.1: must be that of swing_mass, which is 0\.05: at a reset",
+    ),
+    "an uncertain length": (
+        {"uncertainty": {"design": {"arm_length": 0.1}}},
+        r"uncertainty\.design\.arm_length = 0\.1: must be 0 with task\.catch\.reset",
+    ),
     "another start": (
         {"task": {"start": [-0.5, -2, 0, 0]}},
         r"tasks\.light_holds\.start = \[-0\.5, .*: must be \[-0\.572082\d+, -1\.99742\d+, .*end of heavy_holds",
@@ -187,6 +198,26 @@ WRONG = {
 def test_what_is_no_cycle_is_refused(changes, text):
     with pytest.raises(ConfigError, match=text):
         make_problem(parse(_changed(**changes)))
+
+
+@pytest.mark.thorough
+def test_the_worst_robot_of_the_box_is_at_a_corner():
+    """No robot within the box goes farther than the corners do, from the states from which those go farthest."""
+    box = {"design": {"support_mass": 0.1, "swing_mass": 0.1}, "input": 0.1}
+    uncertain, whole = make_problem(parse(_changed(uncertainty=box))), evaluated()
+    key, count = jax.random.key(3), 200
+    exact, _ = worst_after_reset(problem(), whole.tasks, key, count)
+    worst, states = worst_after_reset(uncertain, whole.tasks, key, count)
+    assert np.all(worst > 1.01 * exact)
+    random = np.random.default_rng(0)
+    for _ in range(20):
+        factors = dict(zip(("support_mass", "swing_mass"), 1 + random.uniform(-0.1, 0.1, 2), strict=True))
+        for task in range(2):
+            robot = problem().numbers(row(whole.tasks.candidate, task))
+            robot |= {name: robot[name] * factor for name, factor in factors.items()}
+            following = row(whole.tasks.funnel, 1 - task)
+            off = brachiation.catch(robot, states[task, 0]) - following.policy.trajectory.xs[0]
+            assert off @ following.policy.values[0] @ off / following.levels[0] <= worst[task] * (1 + 1e-9)
 
 
 def test_a_cycle_needs_tasks():

@@ -282,8 +282,9 @@ def _catch(
         return
     if task.catch.cyclic and not tasks:
         yield Problem(("task", "catch", "reset"), "leads from task to task: it needs `tasks`, two at least")
-    if task.catch.cyclic and not uncertainty.empty:
-        yield Problem(("uncertainty",), "must be empty with task.catch.reset: a reset is that of the exact model")
+    if task.catch.cyclic and uncertainty.center == "moving":
+        text = "must be common with task.catch.reset: the next motion is that of the nominal robot"
+        yield Problem(("uncertainty", "center"), text, uncertainty.center)
     if search.objective == GOAL:
         text = "must be another one with task.catch: at a goal that is no equilibrium there is no region"
         yield Problem(("search", "objective"), text, search.objective)

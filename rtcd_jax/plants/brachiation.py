@@ -21,6 +21,9 @@ FIELDS = (
 )  # fmt: skip
 """Of a robot that can brachiate: the length of both arms, and of each mass, center (from its joint), and inertia."""
 
+PAIRS = (("support_mass", "swing_mass"), ("support_inertia", "swing_inertia"))
+"""Of the `FIELDS`, those that change places as they are."""
+
 Numbers = Mapping[str, Any]
 """Of a robot, constants and design, by name."""
 
