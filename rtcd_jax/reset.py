@@ -93,7 +93,7 @@ def worst_after_reset(
     robots = _corners(problem)
     if not robots:
         return of_the_robot({})
-    levels, states = jax.lax.map(of_the_robot, robots)
+    levels, states = jax.vmap(of_the_robot)(robots)
     worst = jnp.argmax(levels, 0)
     return jnp.max(levels, 0), states[worst, np.arange(count)]
 
