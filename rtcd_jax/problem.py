@@ -434,13 +434,13 @@ def _require_agreement(problem: Problem) -> None:
 
 
 def _design(problem: Problem, share: float) -> eqx.Module:
-    """At a share of the way from the initial design to the far corner of its box."""
     return _of_share(problem, share, problem.following)[0]
 
 
 def _of_share(
     problem: Problem, share: float, following: tuple[str, ...] | None
 ) -> tuple[eqx.Module, TaskNumbers | None]:
+    """The design at a share of the way from the initial one to the far corner of its box, and what follows from it."""
     fields = (variable for variable in problem.variables if variable.design)
     design = problem.plant.Design(*(jnp.asarray(v.initial + share * (_far_end(v) - v.initial)) for v in fields))
     return problem.of_design(design, following)

@@ -101,8 +101,10 @@ def worst_after_reset(
 def _corners(problem: Problem) -> Scales:
     """Of the box of robots by the numbers that the reset needs, and the nominal one [R]; empty without such a box."""
     box = problem.uncertainty
-    fields = RESETS[problem.config.task.catch.reset].fields if box is not None else ()
-    widths = {name: width for name, width in (box.parameters if box else {}).items() if name in fields}
+    if box is None:
+        return {}
+    fields = RESETS[problem.config.task.catch.reset].fields
+    widths = {name: width for name, width in box.parameters.items() if name in fields}
     signs = np.array([*itertools.product((-1.0, 1.0), repeat=len(widths)), np.zeros(len(widths))])
     return {name: 1 + width * side for (name, width), side in zip(widths.items(), signs.T, strict=True)}
 
