@@ -38,24 +38,28 @@ SAME = 1e-9
 
 
 class Reset(NamedTuple):
-    """The numbers of a robot that it needs, and which of them change places; what becomes of them, and of the state
-    [n *batch].
+    """The numbers of a robot that it needs, by the robot's joints; those that it changes, and which of them only change
+    places; what becomes of them, and of the state [n *batch].
     """
 
-    fields: tuple[str, ...]
+    fields: Mapping[int, tuple[str, ...]]
+    changed: tuple[str, ...]
     pairs: tuple[tuple[str, str], ...]
     numbers: Callable[..., dict[str, Any]]
     state: Callable[..., Array]
 
 
 class Point(NamedTuple):
-    """A point of a robot with two joints: the numbers that it needs, and its place [2 *batch] in meters."""
+    """A point of a robot in a plane: the numbers that it needs, by the robot's joints; the two angles that it is a
+    function of, [2 joints], and its place [2 *batch] in meters.
+    """
 
-    fields: tuple[str, ...]
+    fields: Mapping[int, tuple[str, ...]]
+    angles: Callable[[int], Float[np.ndarray, "2 joints"]]
     place: Callable[..., Array]
 
 
-POINTS = {"gripper": Point(("arm_length",), brachiation.hook)}
+POINTS = {"gripper": Point(dict.fromkeys(brachiation.FIELDS, ("arm_length",)), brachiation.arms_of, brachiation.hook)}
 """By the name in `task.catch.window`."""
 
 
@@ -64,12 +68,17 @@ class Window(NamedTuple):
     shape, with `speed` > 0 as half width of the velocities.
     """
 
+    angles: Float[np.ndarray, "2 joints"]
     place: Callable[..., Array]
     size: float
     speed: float
 
 
-RESETS = {"brachiation": Reset(brachiation.FIELDS, brachiation.PAIRS, brachiation.exchanged, brachiation.catch)}
+RESETS = {
+    "brachiation": Reset(
+        brachiation.FIELDS, brachiation.ARMS, brachiation.PAIRS, brachiation.exchanged, brachiation.catch
+    )
+}
 """By the name in the configuration."""
 
 
@@ -233,7 +242,7 @@ def _make_problem(config: Config, path: tuple[str, ...]) -> Problem:
         uncertainty=_uncertainty(config),
         catch=np.diag(1 / np.square(task.catch.half_widths)) if task.catch.half_widths else None,
         reset=RESETS[task.catch.reset].state if task.catch.cyclic else None,
-        window=_window(task.catch),
+        window=_window(task.catch, plant.n // 2),
         cost_center=np.array(task.cost_center, float) if task.cost_center else None,
     )
     if problem.window is not None:
@@ -296,9 +305,9 @@ def _keep_out(config: Config) -> tuple[Set, ...]:
     return sets_of(config.task.model_dump().get("keep_out", ()), np.array(ends))
 
 
-def _window(catch: CatchConfig) -> Window | None:
+def _window(catch: CatchConfig, joints: int) -> Window | None:
     for name, size in catch.window.items():
-        return Window(POINTS[name].place, size, catch.speed)
+        return Window(POINTS[name].angles(joints), POINTS[name].place, size, catch.speed)
     return None
 
 
@@ -307,10 +316,11 @@ def _require_point(problem: Problem) -> None:
     not move it at the goal.
     """
     ((name, size),) = problem.config.task.catch.window.items()
-    path, fields = ("task", "catch", "window", name), POINTS[name].fields
-    robot = vars(problem.plant) | vars(initial_design(problem))
-    if problem.plant.n != 4 or any(field not in robot for field in fields):
-        text = f"needs a robot with two joints and {', '.join(fields)}"
+    path, robot = ("task", "catch", "window", name), vars(problem.plant) | vars(initial_design(problem))
+    if lacking := _lacking(problem.plant, robot, POINTS[name].fields):
+        raise ConfigError([Fault(path, lacking, size)])
+    if problem.window is not None and problem.window.speed and problem.plant.n > 4:
+        text = "is no shape of a robot with more than two joints: the hook does not say where all of them are"
         raise ConfigError([Fault(path, text, size)])
     turn = np.asarray(jax.jacfwd(partial(POINTS[name].place, robot))(jnp.asarray(problem.goal)))[:, :2]
     if problem.window is not None and problem.window.speed and np.linalg.cond(turn) > STRETCHED:
@@ -382,9 +392,8 @@ def _require_cycle(problem: Problem) -> None:
         tasks = [alone._with(own) for alone, (_, own) in zip(problem.tasks, designs, strict=True)]
         robots = [vars(alone.plant) | vars(design) for alone, (design, _) in zip(tasks, designs, strict=True)]
         for i, (alone, robot) in enumerate(zip(tasks, robots, strict=True)):
-            if missing := [name for name in reset.fields if name not in robot]:
-                text = f"needs a robot with {', '.join(reset.fields)}; there is no {', '.join(missing)}"
-                raise ConfigError([Fault(("task", "catch", "reset"), text, problem.config.task.catch.reset)])
+            if lacking := _lacking(alone.plant, robot, reset.fields):
+                raise ConfigError([Fault(("task", "catch", "reset"), lacking, problem.config.task.catch.reset)])
             following = (i + 1) % len(names)
             path, behind = ("tasks", names[following]), f"after the reset at the end of {names[i]}"
             for name, value in reset.numbers(robot).items():
@@ -397,6 +406,15 @@ def _require_cycle(problem: Problem) -> None:
                 raise ConfigError([Fault((*path, "start"), text, start.tolist())])
 
 
+def _lacking(plant: Plant, robot: Mapping[str, Any], fields: Mapping[int, tuple[str, ...]]) -> str:
+    """What the robot lacks of those fields, by its number of joints; empty if it has them."""
+    needed = fields.get(plant.n // 2)
+    if needed is None:
+        return f"needs a robot with {' or '.join(map(str, fields))} joints; this one has {plant.n // 2}"
+    missing = [name for name in needed if name not in robot]
+    return f"needs a robot with {', '.join(needed)}; there is no {', '.join(missing)}" if missing else ""
+
+
 def _require_exchangeable(config: Config, reset: Reset) -> None:
     """Raises ConfigError unless the robots of the box are the same after the reset."""
     partners = {name: other for pair in reset.pairs for name, other in (pair, pair[::-1])}
@@ -404,7 +422,7 @@ def _require_exchangeable(config: Config, reset: Reset) -> None:
     for section in ("design", "plant"):
         for name, width in getattr(box, section).items():
             path = ("uncertainty", section, name)
-            if name in reset.fields and width and name not in partners:
+            if name in reset.changed and width and name not in partners:
                 text = "must be 0 with task.catch.reset: after a reset it is another number of the robot"
                 raise ConfigError([Fault(path, text, width)])
             if name in partners and width != (expected := (box.design | box.plant).get(partners[name], 0.0)):

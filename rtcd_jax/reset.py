@@ -103,7 +103,7 @@ def _corners(problem: Problem) -> Scales:
     box = problem.uncertainty
     if box is None:
         return {}
-    fields = RESETS[problem.config.task.catch.reset].fields
+    fields = RESETS[problem.config.task.catch.reset].fields[problem.plant.n // 2]
     widths = {name: width for name, width in box.parameters.items() if name in fields}
     signs = np.array([*itertools.product((-1.0, 1.0), repeat=len(widths)), np.zeros(len(widths))])
     return {name: 1 + width * side for (name, width), side in zip(widths.items(), signs.T, strict=True)}

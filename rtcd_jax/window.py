@@ -2,8 +2,9 @@
 
     C = J' J / window^2 + diag(0, 1 / speed^2)        the catch set of a single motion, J of the point's place
 
-In a last ellipsoid {V <= rho} the point is farthest from its place on the rim of the ellipsoid's shadow on the joints.
-The place is not linear in the joints: the rim is followed through the kinematics themselves.
+In a last ellipsoid {V <= rho} the point is farthest from its place on the rim of the ellipsoid's shadow on the two
+angles that its place is a function of. That function is not linear: the rim is followed through the kinematics
+themselves.
 """
 
 from functools import partial
@@ -55,15 +56,18 @@ def farthest(problem: Problem, candidate: Candidate, last: Ellipsoids, level: Fl
     return jnp.max(_distances(problem, candidate, jnp.sqrt(level) * _rim(problem, last)))
 
 
-def _rim(problem: Problem, last: Ellipsoids) -> Float[Array, "2 rim"]:
-    """Of the shadow of {V <= 1} on the two joints, from its middle."""
-    joints = problem.plant.n // 2
-    angles = np.linspace(0, 2 * np.pi, RIM, endpoint=False)
-    shadow = jnp.linalg.inv(last.values[..., 0])[:joints, :joints]
-    return jnp.linalg.cholesky(shadow) @ np.stack([np.cos(angles), np.sin(angles)])
+def _rim(problem: Problem, last: Ellipsoids) -> Float[Array, "joints rim"]:
+    """Of the shadow of {V <= 1} on the two angles, from its middle, in the joints: where the set has that shadow."""
+    assert problem.window is not None
+    seen = problem.window.angles
+    joints = seen.shape[1]
+    turns = np.linspace(0, 2 * np.pi, RIM, endpoint=False)
+    spread = jnp.linalg.inv(last.values[..., 0])[:joints, :joints] @ seen.T
+    factor = jnp.linalg.cholesky(seen @ spread)
+    return spread @ jnp.linalg.solve(factor.T, np.stack([np.cos(turns), np.sin(turns)]))
 
 
-def _distances(problem: Problem, candidate: Candidate, offsets: Float[Array, "2 rim"]) -> Float[Array, " rim"]:
+def _distances(problem: Problem, candidate: Candidate, offsets: Float[Array, "joints rim"]) -> Float[Array, " rim"]:
     """From the place at the goal, of the point where the joints are off the goal by these."""
     assert problem.window is not None
     place = partial(problem.window.place, problem.numbers(candidate))

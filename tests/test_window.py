@@ -59,17 +59,27 @@ def test_the_linearized_hook_fills_its_window():
     np.testing.assert_allclose(shape[2:, 2:], SPEED**2 * np.eye(2))
 
 
+@cache
+def three_links():
+    """The first swing of RicMonk, in a cycle with a window."""
+    whole = make_problem(experiment({"reset": "brachiation", "window": {"gripper": SIZE}}, "ricmonk"))
+    return whole.tasks[0], decode(whole, jnp.asarray(initial_genome(whole)), jnp.asarray(0))
+
+
+@pytest.mark.parametrize("robot", [swing, three_links])
 @pytest.mark.parametrize("seed", range(3))
-def test_the_largest_ellipsoid_with_the_hook_in_its_window(seed):
-    """Of any shape, through the kinematics themselves: none of 200,000 states on the rim is outside, some are near."""
-    problem, candidate = swing()
-    rng = np.random.default_rng(seed)
-    root = rng.normal(size=(4, 4))
-    last = Ellipsoids.about(jnp.asarray(problem.goal)[:, None], jnp.asarray(root @ root.T + np.eye(4))[..., None])
+def test_the_largest_ellipsoid_with_the_hook_in_its_window(robot, seed):
+    """Of any shape, through the kinematics themselves: none of 400,000 states on the rim is outside, some are near."""
+    problem, candidate = robot()
+    problem = problem.of(candidate)
+    rng, n = np.random.default_rng(seed), problem.plant.n
+    root = rng.normal(size=(n, n))
+    goal = jnp.asarray(problem.goal)
+    last = Ellipsoids.about(goal[:, None], jnp.asarray(root @ root.T + np.eye(n))[..., None])
     radius = float(window_radius(problem, candidate, last))
-    y = rng.normal(size=(4, 200_000))
-    x = last.points(jnp.full((1, 200_000), radius), jnp.asarray(y / np.linalg.norm(y, axis=0))[:, None])[:, 0]
-    off = np.linalg.norm(hook(candidate, x) - hook(candidate, problem.goal[:, None]), axis=0)
+    y = rng.normal(size=(n, 400_000))
+    x = last.points(jnp.full((1, 400_000), radius), jnp.asarray(y / np.linalg.norm(y, axis=0))[:, None])[:, 0]
+    off = np.linalg.norm(hook(candidate, x) - hook(candidate, goal[:, None]), axis=0)
     assert 0.99 * SIZE < off.max() < SIZE
     assert float(farthest(problem, candidate, last, jnp.asarray(radius**2))) == pytest.approx(off.max(), rel=1e-2)
 
@@ -104,10 +114,15 @@ WRONG = {
         "acromonk",
         r"task\.catch\.window = -0\.03: must be >=",
     ),
+    "a third joint": (
+        {"speed": 1.0, **GRIPPER},
+        "ricmonk",
+        r"gripper = 0\.03: is no shape of a robot with more than two joints",
+    ),
     "no gripper": (
         {"speed": 1.0, **GRIPPER},
         "acrobot",
-        r"gripper = 0\.03: needs a robot with two joints and arm_length",
+        r"gripper = 0\.03: needs a robot with arm_length; there is no arm_length",
     ),
 }
 

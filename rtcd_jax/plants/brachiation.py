@@ -1,57 +1,80 @@
-"""The catch of a brachiator of two arms in a plane: the free hook takes the next bar, and the other one lets go.
+"""The catch of a brachiator in a plane: the free hook takes the next bar, and the other one lets go.
 
-    q+ = (q1 + q2 - pi, -q2),        M+(q+) v+ = X(q) v-
+    M+ w+ = X w,   M+_ab = cos(t_a - t_b) sum_i m_i A+_ia A+_ib + [a = b] I_a,   X the same with A-_ib
 
-The arms change places: the joints count from the new bar. The impact is plastic: what the new bar exerts goes through
-its axis, so that of the links' momentum as much is kept as motions about that axis (J+, w+) see of it,
-X = sum_i m_i J+_i' J-_i + I_i w+_i' w-_i; M+ is the same sum with J+ and w+ alone, the mass matrix of the robot that
-hangs from the new bar. Angles are not wrapped.
+of the links' angles t and rates w, counted from hanging: two arms, and a body that hangs where they meet, if there is
+one. A-_ia t_a' is what the center of link i moves by t_a about the old bar, A+ the same about the new one. The impact
+is plastic: what the new bar exerts goes through its axis, so that of the links' momentum as much is kept as motions
+about that axis see of it; M+ is the mass matrix of the robot that hangs from the new bar. The arms change places: the
+joints count from the new bar. Angles are not wrapped.
 """
 
 from collections.abc import Mapping
 from typing import Any
 
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
+from rtcd_jax.numerics.batched import mv, spd_solve
 from rtcd_jax.numerics.trigonometry import cos, sin
 
-FIELDS = (
+ARMS = (
     "arm_length", "support_mass", "support_center", "support_inertia", "swing_mass", "swing_center", "swing_inertia",
 )  # fmt: skip
-"""Of a robot that can brachiate: the length of both arms, and of each mass, center (from its joint), and inertia."""
+"""The length of both arms, and of each mass, center (from its joint), and inertia."""
+
+BODY = ("body_mass", "body_center", "body_inertia")
+"""Of the body between the arms: it stays what it is."""
+
+FIELDS = {2: ARMS, 3: (*ARMS, *BODY)}
+"""The numbers of a robot that can brachiate, by its joints."""
 
 PAIRS = (("support_mass", "swing_mass"), ("support_inertia", "swing_inertia"))
-"""Of the `FIELDS`, those that change places as they are."""
+"""Of the `ARMS`, those that change places as they are."""
 
 Numbers = Mapping[str, Any]
 """Of a robot, constants and design, by name."""
 
 
 def exchanged(numbers: Numbers) -> dict[str, Any]:
-    """Those of the `FIELDS` as the robot hangs from its other hook: the arms change places; the inverse of itself."""
-    arm, m1, c1, i1, m2, c2, i2 = (numbers[name] for name in FIELDS)
-    return dict(zip(FIELDS, (arm, m2, arm - c2, i2, m1, arm - c1, i1), strict=True))
+    """Its links as the robot hangs from its other hook: the arms change places; the inverse of itself."""
+    arm, m1, c1, i1, m2, c2, i2 = (numbers[name] for name in ARMS)
+    arms = dict(zip(ARMS, (arm, m2, arm - c2, i2, m1, arm - c1, i1), strict=True))
+    return arms | {name: numbers[name] for name in BODY if name in numbers}
 
 
-def hook(numbers: Numbers, x: Float[Array, "4 *batch"]) -> Float[Array, "2 *batch"]:
+def arms_of(joints: int) -> Float[np.ndarray, "2 joints"]:
+    """From the joints to the angles of both arms from hanging."""
+    return np.array([[1.0, *[0.0] * (joints - 1)], [1.0] * joints])
+
+
+def hook(numbers: Numbers, x: Float[Array, "n *batch"]) -> Float[Array, "2 *batch"]:
     """Where the free hook is, from the bar that the robot hangs from, forward and up [m], elementwise."""
-    arm, first, second = numbers["arm_length"], x[0], x[0] + x[1]
-    return jnp.stack([arm * (sin(first) + sin(second)), -arm * (cos(first) + cos(second))])
+    arm, support, swing = numbers["arm_length"], x[0], jnp.sum(x[: len(x) // 2], 0)
+    return jnp.stack([arm * (sin(support) + sin(swing)), -arm * (cos(support) + cos(swing))])
 
 
-def catch(numbers: Numbers, x: Float[Array, "4 *batch"]) -> Float[Array, "4 *batch"]:
+def catch(numbers: Numbers, x: Float[Array, "n *batch"]) -> Float[Array, "n *batch"]:
     """x+ of the `exchanged` robot after the catch at x, elementwise; positions [rad], velocities [rad/s]."""
-    arm, m1, c1, i1, m2, c2, i2 = (numbers[name] for name in FIELDS)
-    q1, q2, v1, v2 = x
-    bend = cos(q2)
-    first, second = v1, v1 + v2  # absolute rates of the arms; those after the catch are of the same two, second first
-    second_momentum = -(arm - c2) * m2 * (arm * bend * first + c2 * second) - arm * m1 * c1 * bend * first + i2 * second
-    first_momentum = (i1 - (arm - c1) * m1 * c1) * first
-    m11 = m2 * (arm - c2) ** 2 + m1 * arm**2 + i2
-    m12 = m1 * arm * (arm - c1) * bend
-    m22 = m1 * (arm - c1) ** 2 + i1
-    determinant = m11 * m22 - m12**2
-    second_after = (m22 * second_momentum - m12 * first_momentum) / determinant
-    first_after = (m11 * first_momentum - m12 * second_momentum) / determinant
-    return jnp.stack([q1 + q2 - jnp.pi, -q2, second_after, first_after - second_after])
+    joints = len(x) // 2
+    arm, *arms_and_body = (jnp.asarray(numbers[name]) for name in FIELDS[joints])
+    links = np.split(np.arange(3 * joints), joints)  # mass, center and inertia of each
+    support, swing, *body = [jnp.stack([arms_and_body[i] for i in link]) for link in links]
+    masses, centers, inertias = jnp.stack([support, *body, swing], 1)
+    arms = np.array([1.0, *[0.0] * len(body), 1.0])
+    hung = np.zeros((joints, joints))
+    hung[1:, 0] = 1  # all but the support arm are moved by its end
+    before = jnp.diag(centers) + arm * hung
+    after = jnp.diag(centers - arm * arms) - arm * hung[::-1, ::-1]
+
+    every = (..., *[None] * (x.ndim - 1))  # a number of the robot, beside the batch
+    angles, rates = jnp.cumsum(x[:joints], 0), jnp.cumsum(x[joints:], 0)
+    along, turning = cos(angles[:, None] - angles[None]), jnp.diag(inertias)[every]
+
+    def momentum(moved: Float[Array, "k k"]) -> Float[Array, "k k *batch"]:
+        return (after.T @ (masses[:, None] * moved))[every] * along + turning
+
+    kept, _ = spd_solve(momentum(after), mv(momentum(before), rates)[:, None], 0.0)
+    from_the_new_bar = (angles - np.pi * arms[every])[::-1], kept[::-1, 0]
+    return jnp.concatenate([jnp.diff(chain, axis=0, prepend=0 * chain[:1]) for chain in from_the_new_bar])

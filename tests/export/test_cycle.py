@@ -14,16 +14,18 @@ from tests import test_reset
 from tests.analysis.animate.test_animate import rtcd
 from tests.export.conftest import module
 
-NUMBERS = dict(zip(brachiation.FIELDS, (0.314, 1.04, 0.233, 0.0017, 0.63, 0.125, 0.0041), strict=True))
+NUMBERS = 0.314, 1.04, 0.233, 0.0017, 0.63, 0.125, 0.0041, 2.6, 0.18, 0.0052
 
 
-def test_the_exported_impact_is_that_of_the_search():
-    """Written twice: by the momentum's sums here, entry by entry there."""
+@pytest.mark.parametrize("joints", [2, 3])
+def test_the_exported_impact_is_that_of_the_search(joints):
+    """Written twice: by the links' velocities here, by the angles between them there."""
     cycle = module(TEMPLATES / "rtcd_cycle.py").Cycle()
-    cycle._robots = [NUMBERS]
-    for x in np.random.default_rng(0).normal(size=(100, 4)) * [1, 2, 3, 5]:
+    robot = dict(zip(brachiation.FIELDS[joints], NUMBERS, strict=False))
+    cycle._robots = [robot]
+    for x in np.random.default_rng(0).normal(size=(100, 2 * joints)) * np.repeat([2, 4], joints):
         np.testing.assert_allclose(
-            cycle.after_catch(x), brachiation.catch(NUMBERS, jnp.asarray(x)), rtol=1e-10, atol=1e-11
+            cycle.after_catch(x), brachiation.catch(robot, jnp.asarray(x)), rtol=1e-10, atol=1e-10
         )
 
 

@@ -61,24 +61,24 @@ class Cycle:
     def after_catch(self, x) -> np.ndarray:
         """The model's state from the new bar, after the free hook took it at x, and the other one let go:
 
-        q+ = (q1 + q2 - pi, -q2), M+ v+ = X v-: of the links' momentum as much is kept as motions about the new bar see.
+        M+ w+ = X w- of the links' rates: of their momentum as much is kept as motions about the new bar see.
         """
         robot = self._robots[self.number % len(self._robots)]
-        arm, m1, c1, i1 = (robot[name] for name in ("arm_length", "support_mass", "support_center", "support_inertia"))
-        m2, c2, i2 = (robot[name] for name in ("swing_mass", "swing_center", "swing_inertia"))
-        q1, q2, v1, v2 = np.asarray(x, float).reshape(-1)
-        turns = np.array([q1, q1 + q2]), np.array([v1, v1 + v2])
-        along = np.stack([np.cos(turns[0]), np.sin(turns[0])])  # of the arms' ends, for a unit rate
-        # Velocities of both centers: before, about the old bar; per unit rate of (support, swing), about the new one.
-        before = np.stack([c1 * along[:, 0] * v1, arm * along[:, 0] * v1 + c2 * along[:, 1] * (v1 + v2)])
-        after = np.zeros((2, 2, 2))
-        after[0] = np.stack([-(arm - c1) * along[:, 0], -arm * along[:, 1]])
-        after[1] = np.stack([0 * along[:, 0], -(arm - c2) * along[:, 1]])
-        masses, inertias = np.array([m1, m2]), np.array([i1, i2])
+        links = [link for link in ("support", "body", "swing") if f"{link}_mass" in robot]
+        arm, of_links = robot["arm_length"], ("mass", "center", "inertia")
+        masses, centers, inertias = (np.array([robot[f"{link}_{what}"] for link in links]) for what in of_links)
+        angles, rates = (np.cumsum(part) for part in np.split(np.asarray(x, float).reshape(-1), 2))
+        along = np.stack([np.cos(angles), np.sin(angles)], 1)  # of the links' ends, for a unit rate
+        # Velocities of the links' centers per unit rate of each link: about the old bar, and about the new one.
+        before, after = np.zeros((2, len(links), len(links), 2))
+        before[1:, 0], after[:-1, -1] = arm * along[0], -arm * along[-1]
+        for i, link in enumerate(links):
+            before[i, i], after[i, i] = centers[i] * along[i], (centers[i] - arm * (link != "body")) * along[i]
         mass_matrix = np.einsum("l,lak,lbk->ab", masses, after, after) + np.diag(inertias)
-        momentum = np.einsum("l,lak,lk->a", masses, after, before) + inertias * turns[1]
-        support, swing = np.linalg.solve(mass_matrix, momentum)  # absolute rates of the arms; the swing arm holds now
-        return np.array([q1 + q2 - np.pi, -q2, swing, support - swing])
+        momentum = np.einsum("l,lak,lbk,b->a", masses, after, before, rates) + inertias * rates
+        angles[[0, -1]] -= np.pi  # the arms, from their other ends
+        ends = angles[::-1], np.linalg.solve(mass_matrix, momentum)[::-1]  # the swing arm holds now
+        return np.concatenate([np.diff(end, prepend=0) for end in ends])
 
     def hand_over(self, t: float, x):
         """Begins the next swing at t if x, from the new bar, is inside its first ellipsoid; what its monitor says."""
