@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from rtcd_jax.config.load import OWN, of_one_task
 from rtcd_jax.problem import Problem, Variable
 from rtcd_jax.types import Candidate, TaskNumbers
 
@@ -20,7 +21,8 @@ from rtcd_jax.types import Candidate, TaskNumbers
 def decode(problem: Problem, genome: Float[Array, " d"], task: Int[Array, ""] | None = None) -> Candidate:
     """The candidate that a genome stands for; entries outside [0, 1] leave the box.
 
-    Of several tasks it is asked for the one of this number, with that one's design.
+    Of several tasks it is asked for the one of this number, with that one's design, weights and policy; where none is
+    meant, weights and policy are the first one's.
     """
     values, dimension = {}, 0
     for variable in problem.variables:
@@ -29,6 +31,9 @@ def decode(problem: Problem, genome: Float[Array, " d"], task: Int[Array, ""] | 
             dimension += 1
         else:
             values[variable.name] = jnp.asarray(variable.initial, genome.dtype)
+
+    if not problem.config.shares_all:
+        values = _of_its_own(problem, values, task)
 
     def section(prefix: str) -> list[Array]:
         return [value for name, value in values.items() if name.startswith(prefix)]
@@ -42,6 +47,23 @@ def decode(problem: Problem, genome: Float[Array, " d"], task: Int[Array, ""] | 
         task=task,
         own=own,
     )
+
+
+def _of_its_own(problem: Problem, values: dict[str, Array], task: Int[Array, ""] | None) -> dict[str, Array]:
+    """The values of the variables by their keys in a configuration of this task alone."""
+    tables: dict[str, list[Array]] = {}
+    for name, value in values.items():
+        tables.setdefault(of_one_task(name), []).append(value)
+    number = 0 if task is None else task
+    return {name: jnp.stack(each)[number] if len(each) > 1 else each[0] for name, each in tables.items()}
+
+
+def genome_of_task(
+    problem: Problem, name: str, genome: Float[np.ndarray, "*batch d"]
+) -> Float[np.ndarray, "*batch own"]:
+    """What the genomes for several tasks are to one of them alone: the dimensions that it shares, and its own."""
+    others = tuple(f"{OWN}.{other}." for other in problem.config.tasks if other != name)
+    return genome[..., [i for i, variable in enumerate(problem.free) if not variable.name.startswith(others)]]
 
 
 def _of_task(

@@ -103,7 +103,8 @@ class Variable:
 class Problem:
     """The experiment with its robot. Arrays are numpy: they become constants of compiled programs.
 
-    `variables` are the design fields in the plant's order, then the diagonal of Q, that of R, and those of the policy.
+    `variables` are the design fields in the plant's order, then the diagonal of Q, that of R, and those of the policy;
+    of each task where they are not shared.
     """
 
     config: Config
@@ -222,7 +223,8 @@ def make_problem(config: Config) -> Problem:
         (alone,) = config.each.values()
         return _make_problem(alone, ("task",))
     tasks = tuple(_make_problem(alone, ("tasks", name)) for name, alone in config.each.items())
-    whole = replace(tasks[0], config=config, keep_out=_keep_out(config), tasks=tasks)
+    variables = tuple(_variables(config))
+    whole = replace(tasks[0], config=config, variables=variables, keep_out=_keep_out(config), tasks=tasks)
     if whole.reset is not None:
         _require_cycle(whole)
     return whole

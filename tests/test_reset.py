@@ -138,7 +138,7 @@ def cycle_folder(path):
     for i, (name, alone) in enumerate(zip(problem().config.tasks, problem().tasks, strict=True)):
         one = row(whole.tasks, i)
         stored = arrays_of(alone, one), record_of(alone, one)
-        store_task(folder, name, alone.config, [stored], stored)
+        store_task(folder, name, alone.config, np.asarray, [stored], stored)
     return folder
 
 

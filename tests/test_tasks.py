@@ -10,7 +10,7 @@ import yaml
 
 from rtcd_jax.config import load as configuration
 from rtcd_jax.evaluation import make_evaluate
-from rtcd_jax.genome import decode, encode
+from rtcd_jax.genome import decode, encode, genome_of_task
 from rtcd_jax.problem import make_problem
 from rtcd_jax.system.errors import ConfigError
 from rtcd_jax.types import Status
@@ -93,6 +93,40 @@ def test_a_task_with_other_constants_is_that_robot():
     found = of_task("strong")
     np.testing.assert_array_equal(found.status, expected.status)
     np.testing.assert_allclose(found.volumes["sum"], expected.volumes["sum"], rtol=1e-3)
+
+
+OWN = {"search": {"share": "design"}, "policy": {"authority": {"initial": 0.5, "min": 0.1, "max": 1}}}
+
+
+def test_tasks_that_share_the_design_alone_have_weights_and_policy_of_their_own():
+    """Of a genome's dimensions a task has the design's and its own: what decodes alone from them."""
+    whole = make_problem(experiment(tasks=TASKS, **OWN))
+    genome = np.random.default_rng(0).random(2 + len(TASKS) * 4)
+    assert len(whole.free) == len(genome)
+    seen = set()
+    for number, (name, alone) in enumerate(zip(TASKS, whole.tasks, strict=True)):
+        found = decode(whole, jnp.asarray(genome), jnp.asarray(number))
+        own = genome_of_task(whole, name, genome)
+        np.testing.assert_array_equal(own, [*genome[:2], *genome[2 + 4 * number : 6 + 4 * number]])
+        expected = decode(alone, jnp.asarray(own))
+        for part in ("design", "q", "r", "policy"):
+            pairs = zip(*(jax.tree.leaves(getattr(each, part)) for each in (found, expected)), strict=True)
+            for a, b in pairs:
+                np.testing.assert_array_equal(a, b)
+        seen.add(float(found.r[0]))
+    assert len(seen) == len(TASKS)
+
+
+def test_one_task_of_several_that_share_the_design_alone_is_as_ever():
+    alone = make_problem(experiment(tasks={"right": {}}, **OWN))
+    shared = make_problem(experiment(tasks={"right": {}}, policy=OWN["policy"]))
+    assert [variable.name for variable in alone.variables] == [variable.name for variable in shared.variables]
+
+
+def test_sharing_all_leaves_the_hash_of_a_configuration():
+    hash_of = configuration.config_hash
+    assert hash_of(experiment(search={"share": "all"})) == hash_of(experiment())
+    assert hash_of(experiment(tasks=TASKS, search={"share": "design"})) != hash_of(experiment(tasks=TASKS))
 
 
 def test_a_candidate_has_the_robot_and_the_ends_of_its_task():

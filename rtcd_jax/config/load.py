@@ -67,6 +67,7 @@ LATER_KEYS = (
     ("search", "refine"),
     ("search", "patience"),
     ("search", "over_tasks"),
+    ("search", "share"),
     ("trajectory", "input_share"),
 )
 """At their defaults they leave the hashes of configurations as they were before there were such keys."""
@@ -74,6 +75,9 @@ LATER_KEYS = (
 
 _NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]{0,63}")
 """Of a task: it becomes a folder's."""
+
+OWN = "tasks"
+"""Begins the dotted key of a variable that a task has for itself, and its name follows."""
 
 
 class Config(Settings):
@@ -156,11 +160,23 @@ class Config(Settings):
         return {name: own.get(name) or variable.unit for name, variable in self.design.items()}
 
     def variables(self) -> dict[str, Variable]:
-        """Every variable by its dotted key: the design in the plant's order, then q, r, and the policy's."""
-        variables = {f"design.{name}": variable for name, variable in self.design.items()}
-        for letter, weights in self.weights:
-            variables |= {f"weights.{letter}.{i}": weight for i, weight in enumerate(weights)}
-        return variables | {f"policy.{name}": variable for name, variable in self.policy.variables().items()}
+        """Every variable by its dotted key: the design in the plant's order, then q, r, and the policy's; those of each
+        task with `tasks.NAME.` before them where they are not shared.
+        """
+        design = {f"design.{name}": variable for name, variable in self.design.items()}
+        others = {
+            f"weights.{letter}.{i}": weight for letter, weights in self.weights for i, weight in enumerate(weights)
+        }
+        others |= {f"policy.{name}": variable for name, variable in self.policy.variables().items()}
+        if self.shares_all:
+            return design | others
+        each = ((f"{OWN}.{task}.{name}", variable) for task in self.tasks for name, variable in others.items())
+        return design | dict(each)
+
+    @property
+    def shares_all(self) -> bool:
+        """Whether its tasks have weights and options of the policy in common, or there is only one."""
+        return self.search.share == "all" or len(self.tasks) <= 1
 
     @property
     def at_rest(self) -> bool:
@@ -181,8 +197,13 @@ class Config(Settings):
 
     def logarithmic(self, key: str) -> bool:
         """Whether the search scales the variable of this dotted key logarithmically."""
-        section, _, name = key.partition(".")
+        section, _, name = of_one_task(key).partition(".")
         return section == "weights" or (section == "policy" and self.policy.logarithmic(name))
+
+
+def of_one_task(key: str) -> str:
+    """The dotted key of a variable as the configuration of its task alone has it."""
+    return key.split(".", 2)[2] if key.startswith(f"{OWN}.") else key
 
 
 def _sizes(plant: PlantConfig, task: TaskConfig) -> Iterator[Problem]:

@@ -564,6 +564,10 @@ class SearchConfig(Settings):
         default="geometric_mean",
         description="of several tasks: what of their volumes is maximized; min: ties by the geometric mean",
     )
+    share: Literal["all", "design"] = Field(
+        default="all",
+        description="what several tasks have in common; design: each has its own weights and options of the policy",
+    )
     sigma: float = Field(default=0.3, ge=1e-6, le=1, description="initial step size in the unit box [-]")
     seed: int = Field(default=0, ge=0, lt=2**32, description="of all random numbers [-]")
     chunk: Annotated[int, Field(ge=1, le=2**20)] | Literal["auto"] = Field(

@@ -18,6 +18,9 @@ def begun_from(config: Config, run: Path) -> Config:
     if plant != config.plant.name:
         raise UserError(f"--from {run}: is a run of the {plant}, and the configuration is of the {config.plant.name}")
     _, record = read_elite(run / "elites", require_elites(run)[0])
+    if not config.shares_all:
+        text = "is not for search.share = design: the weights of all tasks have one initial value"
+        raise UserError(f"--from {run}: {text}")
     data = resolved(config)
     for name, variable in config.variables().items():
         if variable.free:

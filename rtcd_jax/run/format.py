@@ -1,5 +1,6 @@
 """Evaluation -> the stable result format of `elites/NNN.npz` and `NNN.json`, which others read."""
 
+import operator
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
@@ -17,7 +18,7 @@ from rtcd_jax.numerics.ellipsoid import Ellipsoids
 from rtcd_jax.numerics.proportion import failure_bound
 from rtcd_jax.policy import input_jumps, options
 from rtcd_jax.problem import Problem
-from rtcd_jax.types import Evaluation, Funnel, Policy, Status, TaskEvaluations, Trajectory
+from rtcd_jax.types import Candidate, Evaluation, Funnel, Policy, Status, TaskEvaluations, Trajectory
 from rtcd_jax.validation import PhysicsComparison
 from rtcd_jax.volume import largest_pushes
 from rtcd_jax.window import farthest
@@ -96,8 +97,7 @@ def record_of(
         **({} if config.plant.name in PLANTS else {"robot": config.plant.model_dump(mode="json")}),
         "parameters": plant.parameters(design),
         "design": {name: float(getattr(searched, name)) for name in plant.design_units},
-        "weights": {"q": host.candidate.q, "r": host.candidate.r},
-        "policy": options(problem, host.candidate),
+        **_weights(problem, host.candidate),
         "units": {
             "states": dict(zip(plant.state_names, plant.state_units, strict=True)),
             "inputs": dict(zip(plant.input_names, plant.input_units, strict=True)),
@@ -141,21 +141,21 @@ def common_arrays(evaluation: TaskEvaluations) -> dict[str, np.ndarray]:
 
 
 def common_record(problem: Problem, evaluation: TaskEvaluations) -> dict[str, Any]:
-    """What a candidate has in common on all of the problem's tasks: design, weights, and the volumes over them."""
+    """What a candidate has in common on all of the problem's tasks: design, weights if they are shared, and the volumes
+    over them.
+    """
     host, config = jax.tree.map(np.asarray, evaluation), problem.config
-    candidate = decode(problem, jnp.asarray(host.genome))
-    each = {
-        name: {
-            "status": Status(int(host.tasks.status[t])).name,
-            "volumes": {volume: values[t] for volume, values in host.tasks.volumes.named.items()},
-        }
-        for t, name in enumerate(config.tasks)
-    }
+    candidate = jax.tree.map(np.asarray, decode(problem, jnp.asarray(host.genome)))
+    each = {}
+    for t, name in enumerate(config.tasks):
+        alone = jax.tree.map(operator.itemgetter(t), host.tasks)
+        each[name] = {"status": Status(int(alone.status)).name, "volumes": dict(alone.volumes.named)}
+        if not config.shares_all:
+            each[name] |= _weights(problem, alone.candidate)
     return {
         "plant": config.plant.name,
         "design": {name: float(getattr(candidate.design, name)) for name in problem.plant.design_units},
-        "weights": {"q": np.asarray(candidate.q), "r": np.asarray(candidate.r)},
-        "policy": options(problem, candidate),
+        **(_weights(problem, candidate) if config.shares_all else {}),
         "status": Status(int(host.status)).name,
         "rung": "sampled",
         "over_tasks": config.search.over_tasks,
@@ -165,6 +165,10 @@ def common_record(problem: Problem, evaluation: TaskEvaluations) -> dict[str, An
         "seed": config.search.seed,
         "config_hash": config_hash(config),
     }
+
+
+def _weights(problem: Problem, candidate: Candidate) -> dict[str, Any]:
+    return {"weights": {"q": candidate.q, "r": candidate.r}, "policy": options(problem, candidate)}
 
 
 def _reset(problem: Problem, host: TaskEvaluations) -> dict[str, Any]:

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -14,7 +15,7 @@ from rtcd_jax.config.load import Config
 from rtcd_jax.config.schema import REFINABLE, REFINEMENT_STEPS
 from rtcd_jax.elite.records import TASKS, Record, elite_names, read_generations, resets_in_words
 from rtcd_jax.evaluation import device_chunk, elite_budget, elite_key, make_evaluate
-from rtcd_jax.genome import initial_genome
+from rtcd_jax.genome import genome_of_task, initial_genome
 from rtcd_jax.problem import Problem, make_problem
 from rtcd_jax.refinement import Refinement
 from rtcd_jax.reset import closed
@@ -206,10 +207,15 @@ def _store_several(
     """Every task's elites and initial candidate in a folder of its own, what they have in common in the run folder."""
     run.tell_time()
     for name, alone, (of_task, first) in zip(problem.config.tasks, problem.tasks, reports, strict=True):
+        own = partial(genome_of_task, problem, name)
         console.message(f"task {name}:")
         _tell(alone, of_task, first, console)
-        stored = [(arrays_of(alone, each.evaluation), record_of(alone, *each)) for each in (*of_task, first)]
-        store_task(run.path, name, alone.config, stored[:-1], stored[-1])
+        stored = []
+        for each in (*of_task, first):
+            evaluation = replace(each.evaluation, genome=own(each.evaluation.genome))
+            record = record_of(alone, *each._replace(evaluation=evaluation))
+            stored.append((arrays_of(alone, evaluation), record))
+        store_task(run.path, name, alone.config, own, stored[:-1], stored[-1])
     run.write_elites((common_arrays(each), common_record(problem, each)) for each in elites)
     run.write_initial(common_arrays(initial), common_record(problem, initial))
     for line in _over_tasks(problem, initial, elites[0]):

@@ -1,7 +1,7 @@
 """The folder of one task in a run for several: it reads as a finished run for this task alone."""
 
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -17,22 +17,27 @@ _RESTORE = "restore it, or make the run again"
 
 
 def store_task(
-    run: Path, name: str, config: Config, elites: Sequence[tuple[Arrays, Record]], initial: tuple[Arrays, Record]
-) -> None:
-    """Writes `run`/tasks/NAME: mark, configuration, provenance, the search as this task saw it, its candidates."""
+    run: Path, name: str, config: Config, own: Callable[[np.ndarray], np.ndarray],
+    elites: Sequence[tuple[Arrays, Record]], initial: tuple[Arrays, Record],
+) -> None:  # fmt: skip
+    """Writes `run`/tasks/NAME: mark, configuration, provenance, the search as this task saw it, its candidates; `own`
+    is what of a genome is its own.
+    """
     folder = run / TASKS / name
     make_folder(folder)
     replace_json(folder / "format.json", mark_of(config, name))
     replace(folder / "config.yaml", dump(config).encode())
     provenance = read_json(run / "provenance.json", _RESTORE)
     replace_json(folder / "provenance.json", provenance | {"config_hash": config_hash(config)})
-    lines = (json.dumps(plain(line), allow_nan=False) for line in generations_of(read_generations(run), name))
+    lines = (json.dumps(plain(line), allow_nan=False) for line in generations_of(read_generations(run), name, own))
     replace(folder / "generations.jsonl", "".join(f"{line}\n" for line in lines).encode())
     write_elites(folder, elites)
     write_elite(folder, INITIAL, *initial)
 
 
-def generations_of(generations: Sequence[Mapping[str, Any]], task: str) -> Iterator[dict[str, Any]]:
+def generations_of(
+    generations: Sequence[Mapping[str, Any]], task: str, of_task: Callable[[np.ndarray], np.ndarray]
+) -> Iterator[dict[str, Any]]:
     """A run's generations as one task saw them: its own volumes, statuses and shares; those of the best candidates are
     of the ones that are best over all tasks.
     """
@@ -50,6 +55,7 @@ def generations_of(generations: Sequence[Mapping[str, Any]], task: str) -> Itera
             {key: value for key, value in line.items() if key != "tasks"}
             | own
             | {
+                "genomes": of_task(np.array(line["genomes"])),
                 "best": None if ranked is None else volumes[ranked],
                 "median": float(np.median(known)) if known else None,
                 "best_so_far": best_so_far,

@@ -8,12 +8,12 @@ from rtcd_jax.numerics.derivatives import jacobian
 from rtcd_jax.plants.brachiation import FIELDS, catch, exchanged, hook
 from tests.plants.robots import design, packaged
 
-ROBOTS = {
-    "acromonk": dict(zip(FIELDS[2], (0.31401, 1.0419, 0.23347, 0.00170863, 0.631065, 0.124776, 0.00412099), strict=True)),
-    "ricmonk": dict(
-        zip(FIELDS[3], (0.3146, 0.31253, 0.17065, 0.00099, 0.31254, 0.19283, 0.0037755, 2.631, 0.18247, 0.00524), strict=True)
-    ),
+NUMBERS = {
+    2: (0.31401, 1.0419, 0.23347, 0.00170863, 0.631065, 0.124776, 0.00412099),
+    3: (0.3146, 0.31253, 0.17065, 0.00099, 0.31254, 0.19283, 0.0037755, 2.631, 0.18247, 0.00524),
 }
+ACROMONK, RICMONK = (dict(zip(FIELDS[joints], NUMBERS[joints], strict=True)) for joints in NUMBERS)
+ROBOTS = {"acromonk": ACROMONK, "ricmonk": RICMONK}
 every_robot = pytest.mark.parametrize("robot", ROBOTS.values(), ids=ROBOTS)
 
 
@@ -24,9 +24,7 @@ def states(robot):
 
 
 def links(robot):
-    """Mass, inertia, and what the center is away from the shoulder, in the link's direction, in the order of the joints;
-    then the same of the hooks, of the arms' ends.
-    """
+    """Mass, inertia, and what the center is away from the shoulder, in the link's direction, in the joints' order."""
     arm, m1, c1, i1, m2, c2, i2, *body = (robot[name] for name in FIELDS[2 + ("body_mass" in robot)])
     between = [(body[0], body[2], body[1])] if body else []
     return [(m1, i1, c1 - arm), *between, (m2, i2, c2)]
@@ -129,7 +127,7 @@ def test_its_derivative_is_that_of_differences(robot):
 
 @pytest.mark.parametrize("name", ROBOTS)
 def test_the_packaged_robot_is_the_one_of_the_formulas(name):
-    """Without gravity and friction the motors' power u'q' of the relative joints is what the energy by hand grows by."""
+    """Without gravity and friction the motors' power u'q' of their joints is what the energy by hand grows by."""
     given = packaged(name)
     still = {key: 0 for key in vars(given) if key.endswith("_damping")}
     plant = packaged(name, gravity=1e-6, **still)

@@ -57,7 +57,7 @@ def run(tmp_path):
         stored = [candidate(alone, 1, 3.0), candidate(alone)]
         for arrays, _ in stored:
             arrays["K_goal"] = np.array([[30.0, 10.0]])
-        store_task(folder, name, alone, stored[:1], stored[1])
+        store_task(folder, name, alone, np.asarray, stored[:1], stored[1])
     return folder
 
 
