@@ -212,7 +212,7 @@ def _store_several(
         _tell(alone, of_task, first, console)
         stored = []
         for each in (*of_task, first):
-            evaluation = replace(each.evaluation, genome=own(each.evaluation.genome))
+            evaluation = replace(each.evaluation, genome=own(np.asarray(each.evaluation.genome)))
             record = record_of(alone, *each._replace(evaluation=evaluation))
             stored.append((arrays_of(alone, evaluation), record))
         store_task(run.path, name, alone.config, own, stored[:-1], stored[-1])
