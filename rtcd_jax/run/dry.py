@@ -18,9 +18,14 @@ def understood(problem: Problem) -> Iterator[str]:
     if problem.tasks:
         for name, alone in zip(problem.config.tasks, problem.tasks, strict=True):
             yield f"task       {name}"
-            yield from understood(alone)
-        return
-    problem = initial(problem)
+            yield from _of_one(initial(alone))
+    else:
+        yield from _of_one(initial(problem))
+    free = [variable.name for variable in problem.free]
+    yield f"search     {len(free)} variables: {', '.join(free)}"
+
+
+def _of_one(problem: Problem) -> Iterator[str]:
     plant, design = problem.plant, initial_design(problem)
     yield f"robot      {problem.config.plant.name}: {plant.convention}"
     bounds = zip(plant.state_names, plant.state_units, problem.state_limits, strict=True)
@@ -58,5 +63,3 @@ def understood(problem: Problem) -> Iterator[str]:
     else:
         within = problem.config.task.catch.in_words(problem.config.plant.states)
         yield f"catch      the motion ends in an ellipsoid about the goal: {within}; nothing is asked after it"
-    free = [variable.name for variable in problem.free]
-    yield f"search     {len(free)} variables: {', '.join(free)}"
