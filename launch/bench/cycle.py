@@ -13,6 +13,8 @@ noise and age.
 
 import argparse
 import itertools
+import sys
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 
@@ -26,6 +28,7 @@ from rtcd_jax.elite.elite import Elite
 from rtcd_jax.elite.records import read_config, task_folders
 from rtcd_jax.elite.simulators import STEP_OF_FASTEST, STEPS, mujoco_of
 from rtcd_jax.problem import RESETS, Reset
+from rtcd_jax.system.errors import UserError
 
 SHOWN, EVERY = 4, 5
 """Swings of the figure, and which of the knots it shows."""
@@ -70,23 +73,28 @@ def robots_of(
     return robots
 
 
-def draw(motions: list[np.ndarray], arm: float, file: Path) -> None:
-    """Both arms of one state's `motions` [N+1 n], bar after bar; an arm keeps its color."""
+def draw(motions: list[np.ndarray], robot: Mapping[str, float], file: Path) -> None:
+    """Both arms, and the body between them, of one state's `motions` [N+1 n], bar after bar; an arm keeps its color."""
     import matplotlib.pyplot as plt
 
     figure, axes = plt.subplots(figsize=(10, 3.2))
     bar = 0.0
     for number, knots in enumerate(motions):
-        joints = [np.full((len(knots), 2), [bar, 0.0])]
-        for angle in (knots[:, 0], knots[:, 0] + knots[:, 1]):
-            joints.append(joints[-1] + arm * np.stack([np.sin(angle), -np.cos(angle)], 1))
+        angles = np.cumsum(knots[:, : knots.shape[1] // 2], 1).T
+        along = np.stack([np.sin(angles), -np.cos(angles)], -1)
+        hook = np.full((len(knots), 2), [bar, 0.0])
+        shoulder = hook + robot["arm_length"] * along[0]
+        free = shoulder + robot["arm_length"] * along[-1]
         colors = ("tab:blue", "tab:red") if number % 2 == 0 else ("tab:red", "tab:blue")
-        for (start, end), color in zip(itertools.pairwise(joints), colors, strict=True):
+        links = [(hook, shoulder, colors[0]), (shoulder, free, colors[1])]
+        if "body_center" in robot:
+            links.insert(0, (shoulder, shoulder + 2 * robot["body_center"] * along[1], "tab:orange"))
+        for start, end, color in links:
             lines = np.stack([start, end])[:, ::EVERY]
             axes.plot(lines[..., 0], lines[..., 1], color=color, alpha=0.35, linewidth=1.2)
-        axes.plot(*joints[2].T, color="0.3", linewidth=0.8)
+        axes.plot(*free.T, color="0.3", linewidth=0.8)
         axes.plot(bar, 0, "ko", markersize=5)
-        bar = joints[2][-1, 0]
+        bar = free[-1, 0]
     axes.plot(bar, 0, "ko", markersize=5)
     axes.set(aspect="equal", xlabel="x [m]", ylabel="z [m]")
     figure.savefig(file, dpi=100, bbox_inches="tight")
@@ -105,6 +113,8 @@ def main() -> None:
     folders = task_folders(options.run)
     elites = [Elite.read(folder, 0) for folder in folders]
     config = read_config(options.run)
+    if not config.task.catch.cyclic:
+        raise UserError(f"{options.run}: is no cycle of tasks (task.catch.reset)")
     box, reset, random = config.uncertainty, RESETS[config.task.catch.reset], np.random.default_rng(1)
     x = elites[0].points(np.zeros(options.states, int), np.random.default_rng(0))
     x = elites[0].x[0] + options.scale * (x - elites[0].x[0])
@@ -125,8 +135,11 @@ def main() -> None:
         print(f"| {number + 1} | {name} | {elite.time[-1]:.3g} | {level:.3g} | {out.sum()} of {len(out)} |")
         x = ends
     if options.figure:
-        draw(motions[:SHOWN], elites[0].parameters["arm_length"], options.figure)
+        draw(motions[:SHOWN], elites[0].parameters, options.figure)
 
 
 if __name__ == "__main__":
-    main()
+    try:
+        main()
+    except UserError as error:
+        sys.exit(str(error))

@@ -19,6 +19,7 @@ from rtcd_jax.analysis.report.reading import Run, read_run
 from rtcd_jax.analysis.report.words import words
 from rtcd_jax.config.schema import PolicyConfig
 from rtcd_jax.elite.elite import Elite
+from rtcd_jax.system.errors import UserError
 
 NONE = ""
 Rows = Iterator[tuple[str, ...]]
@@ -181,4 +182,7 @@ def main() -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    try:
+        sys.exit(main())
+    except UserError as error:
+        sys.exit(str(error))
