@@ -345,6 +345,12 @@ class CertifyOptions(Options):
     solver: Annotated[str, shown("NAME")] = Field(
         default="CLARABEL", description="of the semidefinite programs, by cvxpy's name: SCS, MOSEK, COPT, ..."
     )
+    share: float = Field(
+        default=1.0,
+        description="of the sampled levels, that are proved at most: smaller ellipsoids have simpler proofs [-]",
+        gt=0,
+        le=1,
+    )
     workers: int = Field(default=0, description="processes, one elite each; 0 for one a core [-]", ge=0)
 
 
@@ -353,7 +359,7 @@ def certify(options: CertifyOptions, console: Console) -> Exit:
     from rtcd_jax.elite.records import elite_name
 
     workers, only = options.workers or cores(), None if options.elite is None else elite_name(options.elite)
-    how = options.optimize_value, options.uncertainty, options.solver, only
+    how = options.optimize_value, options.uncertainty, options.solver, options.share, only
     with heeding_sigterm():
         folders = _each_task(options.run, console)
         goals = [certify_run(each, options.elites, options.guarantee, workers, console, *how) for each in folders]

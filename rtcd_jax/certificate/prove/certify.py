@@ -90,12 +90,14 @@ def certify_elite(
     optimize_value: bool = False,
     uncertainty: Path | UncertaintyConfig | None = None,
     solver: str = SOLVER,
+    share: float = 1.0,
     target: str = "certificates",
 ) -> Outcome | None:
     """Writes NAME.json into a run's folder `target`; None if not even a goal region can be shown.
 
     `optimize_value` chooses the ellipsoids' shapes so that the funnel is large. The certificate bears what the run
-    bore, or another `uncertainty`, or that of a file. `solver` is by cvxpy's name. A certificate that is there already,
+    bore, or another `uncertainty`, or that of a file. `solver` is by cvxpy's name. With a `share` below 1 no level is
+    above so much of the sampled ones. A certificate that is there already,
     of the same claim in the same way, is not made again.
 
     Raises:
@@ -104,7 +106,7 @@ def certify_elite(
     """
     lock = run / target / f".{name}.lock"
     with held(lock, f"elite {name} of {run}", "it is being proved there"), removed(lock):
-        return _certified(run, name, guarantee, on_step, optimize_value, uncertainty, solver, target)
+        return _certified(run, name, guarantee, on_step, optimize_value, uncertainty, solver, share, target)
 
 
 def _certified(
@@ -115,6 +117,7 @@ def _certified(
     optimize_value: bool,
     uncertainty: Path | UncertaintyConfig | None,
     solver: str,
+    share: float,
     target: str,
 ) -> Outcome | None:
     """`certify_elite` of an elite that no other process is at."""
@@ -122,6 +125,8 @@ def _certified(
     elite = Elite.read(run, name)
     if optimize_value and elite.keep_out:
         raise UserError(f"--optimize_value: {run} has sets to keep out of (task.keep_out), which it does not know")
+    if optimize_value and share < 1:
+        raise UserError("--optimize_value: has no sampled levels of which --share could be a part")
     bounds, folder = bounds_of(elite, uncertainty_of(elite, uncertainty)), run / target
     loop_record = claim_of(elite, bounds)
     misfits: tuple[Any, ...] = ()
@@ -130,6 +135,8 @@ def _certified(
         loop_record |= delay.record()
         misfits = delay.misfits, delay.misfit_at_goal
     head = {"claim": check.digest(loop_record), "rung": guarantee, "optimize_value": optimize_value, "solver": solver}
+    if share < 1:
+        head |= {"share": share}
 
     def checking(done: int, of: int) -> None:
         on_step(Checking(name, done, of))
@@ -137,7 +144,7 @@ def _certified(
     if (content := _finished(folder / f"{name}.json", head, elite, checking)) is not None:
         return _outcome(name, content, elite, guarantee, math.nan)
     claim = _read(loop_record, elite)
-    loop, exact = Loop(claim, elite, *misfits), guarantee == "proved"
+    loop, exact = Loop(claim, elite, *misfits, share=share), guarantee == "proved"
     journal = Journal(folder / f".{name}.partial.jsonl", head)
     if optimize_value:
         loop = _shaped(loop, journal)

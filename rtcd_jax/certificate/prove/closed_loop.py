@@ -141,10 +141,17 @@ class Loop:
     """The claimed loop in float64, and the value function that shapes its funnel.
 
     Between knots S is the cubic Hermite interpolant of S_k with the slopes of the policy's Riccati equation, unless
-    it is `shaped` anew.
+    it is `shaped` anew. No level is above this `share` of the sampled ones, if it is below 1.
     """
 
-    def __init__(self, claim: check.Claim, elite: Elite, misfits: Sequence[float] = (), misfit_at_goal: float = 0.0):
+    def __init__(
+        self,
+        claim: check.Claim,
+        elite: Elite,
+        misfits: Sequence[float] = (),
+        misfit_at_goal: float = 0.0,
+        share: float = 1.0,
+    ):
         self.claim, self.age = claim, float(claim.age)
         self.robot, self.n, self.hinges = claim.robot, claim.n, list(claim.robot.hinges)
         self.parameters = {name: float(low + high) / 2 for name, (low, high) in claim.parameters.items()}
@@ -169,6 +176,7 @@ class Loop:
         self.gains, self.goal, self.goal_gain = floats(claim.K), floats(claim.x_goal), floats(claim.K_goal)
         self.bounds = np.array([np.inf if b is None else float(b) for b in claim.bounds])
         self.keep_out = elite.keep_out
+        self._largest = share * elite.rho if share < 1 else None
         self.values = elite.S
         a, b = np.zeros((len(self.u), 2, self.n, self.n)), np.zeros((len(self.u), 2, self.n, 1))
         for k, u in enumerate(self.u):
@@ -291,13 +299,14 @@ class Loop:
         return self.bounds - np.max(np.abs(center[:, None] + shift), axis=1)
 
     def box_level(self, k: int, fraction: float) -> float:
-        """The level of the ellipsoid that touches a limit on the states or a set to keep out of.
+        """The level of the ellipsoid that touches a limit on the states or a set to keep out of, or the largest one
+        that is wanted.
 
         Raises:
             Refused: x* is in such a set.
         """
         s, _ = self.value(k, fraction)
-        level = _touching(self.clearance(k, fraction), s)
+        level = min(_touching(self.clearance(k, fraction), s), self._most(k, fraction))
         return self._clear(level, self.nominal(k, fraction)[0], s, self.shift(k, fraction)[0])
 
     def sides(self, k: int, start: float, end: float) -> list[list]:
@@ -330,7 +339,14 @@ class Loop:
         """As `box_level`; half a turn away is another equilibrium, which no goal region has in it."""
         clearance = self.bounds - np.abs(self.goal)
         clearance[self.hinges] = np.minimum(clearance[self.hinges], np.pi)
-        return self._clear(_touching(clearance, self.values[-1]), self.goal, self.values[-1])
+        level = min(_touching(clearance, self.values[-1]), self._most(len(self.u) - 1, 1.0))
+        return self._clear(level, self.goal, self.values[-1])
+
+    def _most(self, k: int, fraction: float) -> float:
+        """The largest level that is wanted: between the knots' geometrically."""
+        if self._largest is None:
+            return np.inf
+        return float(self._largest[k] ** (1 - fraction) * self._largest[k + 1] ** fraction)
 
     def goal_growth(self, rho: float, directions: np.ndarray) -> float:
         """As `growth`, about the goal."""

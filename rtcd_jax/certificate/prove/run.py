@@ -76,6 +76,7 @@ def certify_run(
     optimize_value: bool = False,
     uncertainty: Path | None = None,
     solver: str = SOLVER,
+    share: float = 1.0,
     only: str | None = None,
 ) -> bool:
     """Certificates of a run's best elites, or `only` of one; True if every funnel was shown from t = 0 to the goal.
@@ -103,7 +104,7 @@ def certify_run(
         read_json(summary, _ADVICE)  # what is damaged is told before the proofs, not after them
     outcomes: dict[str, Outcome | None] = {}
     clock, pace = Clock(), Pace(names, workers)
-    for event in _events(folder, names, workers, (guarantee, optimize_value, uncertainty, solver)):
+    for event in _events(folder, names, workers, (guarantee, optimize_value, uncertainty, solver, share)):
         match event:
             case Step():
                 pace.step(event.elite, 1 - (event.knot + event.fraction) / event.knots, clock.elapsed)
@@ -139,7 +140,7 @@ def certify_run(
 
 
 def _events(
-    folder: Path, names: Sequence[str], workers: int, how: tuple[str, bool, Path | None, str]
+    folder: Path, names: Sequence[str], workers: int, how: tuple[str, bool, Path | None, str, float]
 ) -> Iterator[Step | Checking | tuple[str, Outcome | None]]:
     """Steps of all elites as they come, and every elite's outcome by its name."""
     # One thread each: there is a worker for every core, and small matrices in many threads cost ten times as much.
