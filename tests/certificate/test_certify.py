@@ -93,6 +93,28 @@ def steps_of(stored):
     return list(proof.intervals_from(proof.outlet(15.0)))
 
 
+@pytest.mark.thorough
+def test_a_share_of_the_sampled_levels_is_proved_at_most(tmp_path):
+    arrays, _ = swing.elite()
+    share, sampled = 0.01, np.full(len(arrays["rho"]), 20.0)
+    run = folder_of(tmp_path, rho=sampled)
+    volumes = []
+    for part in (1.0, share):
+        outcome = elite.certify_elite(run, "000", "proved", lambda step: None, share=part)
+        assert outcome is not None
+        assert outcome.whole
+        volumes.append(outcome.volumes)
+    assert all(volumes[1][name] < volumes[0][name] for name in volumes[0])
+    content = json.loads((run / "certificates" / "000.json").read_text())
+    stored = Elite.read(run, "000")
+    loop = Loop(claimed(stored), stored)
+    for each in content["funnel"]:
+        interval = check.read_interval(check.Node("funnel", each), loop.claim)
+        axes = np.array(interval.first, float)
+        s = loop.value(interval.knot, float(interval.start))[0]
+        assert np.linalg.eigvalsh(axes.T @ s @ axes).max() <= share * sampled[0] * (1 + 1e-6)
+
+
 def test_a_gain_of_the_wrong_sign_cannot_be_proved(tmp_path):
     arrays, _ = swing.elite()
     run = folder_of(tmp_path, K_goal=-arrays["K_goal"])
