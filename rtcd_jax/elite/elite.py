@@ -29,6 +29,8 @@ class NoFunnel(UserError):
 
 OPTIONAL = ("pushes", "S_rates", "center_offsets")
 """Arrays that not every elite has."""
+UNBOUNDED = ("state_limits", "pushes")
+"""Arrays that may have infinity in them: pushes of a motor that moves nothing."""
 
 LEAST_LEFT = 1e-6
 """Share of a radius that stands for nothing, where the robots' own motions are farther apart than their ellipsoids."""
@@ -96,7 +98,8 @@ class Elite:
                 f"an elite with {knots} knots, {n} states and {m} inputs cannot have {', '.join(wrong)}: must be "
                 + ", ".join(f"{name} {shape}" for name, shape in shapes.items())
             )
-        wild = [name for name in shapes if name != "state_limits" and not np.all(np.isfinite(getattr(self, name)))]
+        finite = (name for name in shapes if name not in UNBOUNDED)
+        wild = [name for name in finite if not np.all(np.isfinite(getattr(self, name)))]
         if wild:
             raise UserError(f"the elite has numbers in {', '.join(wild)} that are not finite")
         if not np.all(np.linalg.eigvalsh(self.R) > 0):
