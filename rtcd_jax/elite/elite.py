@@ -98,9 +98,9 @@ class Elite:
                 f"an elite with {knots} knots, {n} states and {m} inputs cannot have {', '.join(wrong)}: must be "
                 + ", ".join(f"{name} {shape}" for name, shape in shapes.items())
             )
-        finite = (name for name in shapes if name not in UNBOUNDED)
-        wild = [name for name in finite if not np.all(np.isfinite(getattr(self, name)))]
-        if wild:
+        arrays = {name: getattr(self, name) for name in shapes}
+        allowed = {name: ~np.isnan(a) if name in UNBOUNDED else np.isfinite(a) for name, a in arrays.items()}
+        if wild := [name for name, each in allowed.items() if not each.all()]:
             raise UserError(f"the elite has numbers in {', '.join(wild)} that are not finite")
         if not np.all(np.linalg.eigvalsh(self.R) > 0):
             raise UserError("the elite's R is not positive definite")

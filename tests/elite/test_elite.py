@@ -49,6 +49,16 @@ def test_null_among_the_limits_is_none_at_all_and_volumes_are_known_by_name():
     assert elite.volumes == {"sum": 3.0}
 
 
+def test_any_push_on_a_motor_that_moves_nothing_is_borne():
+    """And none is not a number."""
+    arrays, record = swing.elite()
+    arrays = arrays | {"pushes": np.full((len(arrays["time"]), 1), np.inf)}
+    assert np.all(np.isinf(Elite.of(arrays, record).pushes))
+    arrays["pushes"][0] = np.nan
+    with pytest.raises(UserError, match="pushes that are not"):
+        Elite.of(arrays, record)
+
+
 def test_a_claimed_funnel_promises_that_no_state_fails():
     arrays, record = swing.elite()
     claimed = {key: value for key, value in record.items() if key not in ("epsilon", "confidence")}
