@@ -58,9 +58,8 @@ def hook(numbers: Numbers, x: Float[Array, "n *batch"]) -> Float[Array, "2 *batc
 def catch(numbers: Numbers, x: Float[Array, "n *batch"]) -> Float[Array, "n *batch"]:
     """x+ of the `exchanged` robot after the catch at x, elementwise; positions [rad], velocities [rad/s]."""
     joints = len(x) // 2
-    arm, *arms_and_body = (jnp.asarray(numbers[name]) for name in FIELDS[joints])
-    links = np.split(np.arange(3 * joints), joints)  # mass, center and inertia of each
-    support, swing, *body = [jnp.stack([arms_and_body[i] for i in link]) for link in links]
+    arm, *links = (jnp.asarray(numbers[name]) for name in FIELDS[joints])
+    support, swing, *body = jnp.stack(links).reshape(joints, 3)  # mass, center and inertia of each
     masses, centers, inertias = jnp.stack([support, *body, swing], 1)
     arms = np.array([1.0, *[0.0] * len(body), 1.0])
     hung = np.zeros((joints, joints))
@@ -77,4 +76,4 @@ def catch(numbers: Numbers, x: Float[Array, "n *batch"]) -> Float[Array, "n *bat
 
     kept, _ = spd_solve(momentum(after), mv(momentum(before), rates)[:, None], 0.0)
     from_the_new_bar = (angles - np.pi * arms[every])[::-1], kept[::-1, 0]
-    return jnp.concatenate([jnp.diff(chain, axis=0, prepend=0 * chain[:1]) for chain in from_the_new_bar])
+    return jnp.concatenate([jnp.diff(chain, axis=0, prepend=jnp.zeros_like(chain[:1])) for chain in from_the_new_bar])
