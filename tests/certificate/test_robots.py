@@ -65,7 +65,7 @@ def assert_field_is_mujoco_s(elite, seed=0):
 
 
 @pytest.mark.parametrize("seed", range(3))
-@pytest.mark.parametrize("name", PLANTS)
+@pytest.mark.parametrize("name", [name for name, plant in PLANTS.items() if len(plant().input_units) == 1])
 def test_the_derived_field_is_c_mujoco_s(name, seed):
     random = np.random.default_rng(seed)
     numbers = {

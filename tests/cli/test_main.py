@@ -154,7 +154,7 @@ def test_all_errors_of_a_file_at_once(tmp_path):
         "  trajectory.knots = 'many': must be a whole number; knots N+1 of the nominal motion [-] (paper, section III)",
         "  funnel.confidence = 1.0: must be > 0 and < 1; 1 - beta, jointly over the knots [-]",
         "  search.sed = 0: unknown key; did you mean 'seed'? Valid: objective, at_least, mode, population, "
-        "generations, patience, over_tasks, sigma, seed, chunk, refine, nested",
+        "generations, patience, over_tasks, share, sigma, seed, chunk, refine, nested",
     ]
 
 
