@@ -18,10 +18,6 @@ CPU_FLAGS = (
     "--xla_backend_extra_options=xla_cpu_small_while_loop_byte_threshold=100000000",
 )
 """XLA's options for the CPU."""
-ONLY_CPU_FLAGS = ("--xla_backend_optimization_level=2",)
-"""And where there is no GPU, whose compiler the option is for, too: nearly half of a small robot's compilation, for
-programs as fast. (1 is no better: of some programs LLVM then takes more than 20 GiB.)
-"""
 CACHE_SIZE = 4 * 2**30
 """Bytes of compiled programs that are kept; those that were used least lately go first."""
 CGROUP = Path("/sys/fs/cgroup")
@@ -43,11 +39,7 @@ def prepare_jax(cpu_devices: int | None = None, cache: str | None = None) -> Non
     before the latter. Call it before anything else of JAX.
     """
     flags = os.environ.get("XLA_FLAGS", "")
-    ours = (
-        flag
-        for flag in (*CPU_FLAGS, *(GPU_FLAGS if _has_cuda() else ONLY_CPU_FLAGS))
-        if flag.split("=")[0] not in flags
-    )
+    ours = (flag for flag in (*CPU_FLAGS, *(GPU_FLAGS if _has_cuda() else ())) if flag.split("=")[0] not in flags)
     os.environ["XLA_FLAGS"] = " ".join([flags, *ours]).strip()
     import jax
 
