@@ -13,7 +13,6 @@ noise and age.
 
 import argparse
 import itertools
-import sys
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -21,6 +20,7 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 import numpy as np
+from measure import as_script
 
 from rtcd_jax.config.schema import UncertaintyConfig
 from rtcd_jax.elite.closed_loop import ClosedLoop, fastest_rate, outside_limits, runge_kutta
@@ -139,7 +139,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    try:
-        main()
-    except UserError as error:
-        sys.exit(str(error))
+    as_script(main)

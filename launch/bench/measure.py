@@ -4,13 +4,17 @@ import datetime
 import json
 import os
 import platform
+import sys
+from collections.abc import Callable
 from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 from rtcd_jax.analysis.scale.clock import Timed, peak_memory, timed
+from rtcd_jax.config.load import Config, load
 from rtcd_jax.system.devices import prepare_jax
+from rtcd_jax.system.errors import UserError
 
 RESULTS = Path(__file__).parent / "results"
 CONFIG = Path(__file__).parents[2] / "configs" / "pendulum_rtcd.yaml"
@@ -42,6 +46,14 @@ def save(name: str, record: dict[str, Any], folder: Path = RESULTS) -> Path:
     return path
 
 
+def as_script(main: Callable[[], int | None]) -> NoReturn:
+    """Ends with main's exit code, or with a line about what it was given."""
+    try:
+        sys.exit(main())
+    except UserError as error:
+        sys.exit(str(error))
+
+
 @dataclass(frozen=True)
 class Measured:
     """rtcd_jax's pipeline for one population: compilation, repeated calls on fresh genomes, memory [bytes]."""
@@ -56,7 +68,7 @@ class Measured:
     resident_peak: int
 
 
-def measure_pipeline(config: Path, population: int, repeats: int, rollouts: str | None = None) -> Measured:
+def measure_pipeline(config: Path | Config, population: int, repeats: int, rollouts: str | None = None) -> Measured:
     """Compile the evaluation of `population` genomes once, then time `repeats` calls, each with other genomes.
 
     `rollouts` takes the place of the configuration's `funnel.rollouts`.
@@ -65,12 +77,11 @@ def measure_pipeline(config: Path, population: int, repeats: int, rollouts: str 
     prepare_jax(1)
     import jax
 
-    from rtcd_jax.config.load import load
     from rtcd_jax.evaluation import make_evaluate
     from rtcd_jax.problem import make_problem
     from rtcd_jax.types import Status
 
-    settings = load(config)
+    settings = load(config) if isinstance(config, Path) else config
     if rollouts is not None:
         funnel = settings.funnel.model_copy(update={"rollouts": rollouts})
         settings = settings.model_copy(update={"funnel": funnel})

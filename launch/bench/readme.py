@@ -10,16 +10,16 @@ is less.
 
 import argparse
 import math
-import sys
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
+
+from measure import as_script
 
 from rtcd_jax.analysis.report.publication import PAPER
 from rtcd_jax.analysis.report.reading import Run, read_run
 from rtcd_jax.analysis.report.words import words
 from rtcd_jax.config.schema import PolicyConfig
 from rtcd_jax.elite.elite import Elite
-from rtcd_jax.system.errors import UserError
 
 NONE = ""
 Rows = Iterator[tuple[str, ...]]
@@ -182,7 +182,4 @@ def main() -> int:
 
 
 if __name__ == "__main__":
-    try:
-        sys.exit(main())
-    except UserError as error:
-        sys.exit(str(error))
+    as_script(main)

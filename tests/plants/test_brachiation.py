@@ -70,7 +70,7 @@ def test_it_is_the_impact_of_free_links(robot):
     joints = len(x) // 2
     after = np.cumsum(np.asarray(catch(robot, jnp.asarray(x)))[joints:], 0)
     expected = np.array([_impact(robot, each[:joints], each[joints:]) for each in x.T]).T
-    np.testing.assert_allclose(after[::-1], expected, atol=1e-11)
+    np.testing.assert_allclose(after[::-1], expected, atol=1e-12)
 
 
 @every_robot
@@ -106,13 +106,14 @@ def _energy(robot, x):
     return sum(0.5 * (m * ((shoulder + _turn(r, a) * w) ** 2).sum(0) + i * w**2) for (m, i, r), a, w in parts)
 
 
-@every_robot
-def test_it_loses_energy_and_a_motion_about_the_new_bar_none(robot):
+@pytest.mark.parametrize(("robot", "share"), [(ACROMONK, 0.3), (RICMONK, 0.15)], ids=ROBOTS)
+def test_it_loses_energy_and_a_motion_about_the_new_bar_none(robot, share):
+    """A tail that hangs freely keeps more of it."""
     x = states(robot)
     before = _energy(robot, x)
     lost = before - _energy(exchanged(robot), np.asarray(catch(robot, jnp.asarray(x))))
     assert np.all(lost > 0)
-    assert np.median(lost / before) > 0.1
+    assert np.median(lost / before) > share
 
 
 @every_robot
@@ -122,7 +123,7 @@ def test_its_derivative_is_that_of_differences(robot):
     for i in range(len(x)):
         away = jnp.zeros((len(x), 1)).at[i].set(step)
         differences = (catch(robot, x + away) - catch(robot, x - away)) / (2 * step)
-        np.testing.assert_allclose(exact[:, i], differences, atol=1e-6)
+        np.testing.assert_allclose(exact[:, i], differences, atol=1e-7)
 
 
 @pytest.mark.parametrize("name", ROBOTS)
@@ -136,6 +137,6 @@ def test_the_packaged_robot_is_the_one_of_the_formulas(name):
     x = states(robot)
     u = jnp.ones((plant.m, x.shape[1]))
     rates = np.asarray(plant.dynamics(design(name, **fields), jnp.asarray(x), u))
-    gradient = np.stack([(_energy(robot, x + e) - _energy(robot, x - e)) / 2e-6
-                         for e in 1e-6 * np.eye(len(x))[:, :, None]])  # fmt: skip
-    np.testing.assert_allclose((gradient * rates).sum(0), x[len(x) // 2 + 1 :].sum(0), atol=1e-4)
+    gradient = np.stack([(_energy(robot, x + e) - _energy(robot, x - e)) / 2e-5
+                         for e in 1e-5 * np.eye(len(x))[:, :, None]])  # fmt: skip
+    np.testing.assert_allclose((gradient * rates).sum(0), x[len(x) // 2 + 1 :].sum(0), atol=1e-5)

@@ -97,8 +97,8 @@ def certify_elite(
 
     `optimize_value` chooses the ellipsoids' shapes so that the funnel is large. The certificate bears what the run
     bore, or another `uncertainty`, or that of a file. `solver` is by cvxpy's name. With a `share` below 1 no level is
-    above so much of the sampled ones. A certificate that is there already,
-    of the same claim in the same way, is not made again.
+    above so much of the sampled ones. A certificate that is there already, of the same claim in the same way, is not
+    made again.
 
     Raises:
         UserError: an elite that is not there, or of a plant that the checker does not know, or that another process is
