@@ -10,23 +10,26 @@ error of the measured state, and its age are anyone's choice. All that acts thro
     disturbance:             u -+ w
 
 `Worst` takes, at every Runge-Kutta stage, that end of the interval and that corner of the parameters which raise
-V = e'S(t)e fastest: the signs of dV'/du and of dV'/dp, one reverse sweep for all parameters. This is greedy, and of
-first order in the parameters: the held-out samples are those of `Drawn` robots, which are what epsilon is about.
+V = e'S(t)e fastest: the signs of dV'/du and of dV'/dp. One reverse sweep of x' finds them, through the few numbers that
+it needs of a robot (`Plant.lumped`); these are computed at the corners once, and a state picks among them. This is
+greedy, and of first order in the parameters: the held-out samples are those of `Drawn` robots, which are what epsilon
+is about.
 
 Where the parameters are constant in time (`uncertainty.center: moving`), V is about the robot's own motion instead of
 x*(t), its numbers are given, and the adversary has all the rest.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
+from functools import cache, partial
 from types import MappingProxyType
-from typing import Any, NamedTuple, TypeVar, final
+from typing import Any, NamedTuple, TypeVar, cast, final
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int, PRNGKeyArray
+from jaxtyping import Array, Float, Int, PRNGKeyArray, PyTree
 
-from rtcd_jax.numerics.entries import held
+from rtcd_jax.numerics.entries import dependent
 from rtcd_jax.numerics.integrate import split
 from rtcd_jax.plants.base import Plant
 from rtcd_jax.types import Uncertainty
@@ -59,9 +62,8 @@ class Situation(NamedTuple):
     def late(self, plant: Plant, design: eqx.Module, scales: "Scales") -> Float[Array, "m *batch"]:
         """By how much the scaled robot's input rises for each second of the measurement's age."""
         clipped = jnp.clip(self.asked, -self.bounds, self.bounds)
-        rate = scaled_rate(plant, design, scales, jnp.stack(self.x), clipped)
-        moving = rate - self.nominal_rate
-        return _times(self.gain, moving)
+        rates = plant.rates(scaled_numbers(plant, design, scales), self.x, clipped)
+        return _times(self.gain, [a - b for a, b in zip(rates, self.nominal_rate, strict=True)])
 
 
 Scales = Mapping[str, Float[Array, "*#batch"]]
@@ -104,23 +106,23 @@ class Worst(NamedTuple):
             spread = _times(jnp.abs(at.gain), may.noise)
             low, high = low - spread, high + spread
         weak, strong = at.bounds * (1 - may.input_limit), at.bounds * (1 + may.input_limit)
-        low = jnp.minimum(jnp.clip(low, -weak, weak), jnp.clip(low, -strong, strong)) - may.input
-        high = jnp.maximum(jnp.clip(high, -weak, weak), jnp.clip(high, -strong, strong)) + may.input
-        x, n = jnp.stack(at.x), len(at.x)
+        low, high = jnp.clip(low, -strong, weak) - may.input, jnp.clip(high, -weak, strong) + may.input
         error = at.error if at.shift is None else [e - s for e, s in zip(at.error, at.shift, strict=True)]
-        slope_of_v = jnp.stack([sum(at.cost[i, j] * error[j] for j in range(n)) for i in range(n)])
+        slope_of_v = [sum(each * e for each, e in zip(row, error, strict=True)) for row in at.cost]
 
-        def rate(scales, u):
-            return scaled_rate(self.plant, design, {**self.scales, **scales}, x, u)
+        def numbers(factors: Sequence) -> PyTree:
+            scales = dict(zip(may.parameters, factors, strict=True))
+            return scaled_numbers(self.plant, design, {**self.scales, **scales})
 
-        def power(scales, u):
-            return jnp.sum(slope_of_v * rate(scales, u))
+        def power(values, u):
+            rates = self.plant.rates(jax.tree.unflatten(structure, values), at.x, u)
+            return jnp.sum(sum(slope * rate for slope, rate in zip(slope_of_v, rates, strict=True)))
 
-        ones = {name: jnp.ones_like(at.x[0]) for name in may.parameters}
-        slopes, push = jax.grad(power, argnums=(0, 1))(ones, (low + high) / 2)
-        worst = {name: 1 + width * jnp.sign(slopes[name]) for name, width in may.parameters.items()}
-        value = sum(slope_of_v[i] * error[i] for i in range(n))
-        return split(rate(*held((worst, jnp.where(push > 0, high, low)), jnp.sign(1 + value))))
+        nominal, structure = jax.tree.flatten(numbers([1.0] * len(may.parameters)))
+        everywhere = [jnp.broadcast_to(value, at.x[0].shape) for value in nominal]
+        slopes, push = jax.grad(power, argnums=(0, 1))(everywhere, (low + high) / 2)
+        worst = _corner(lambda factors: jax.tree.leaves(numbers(factors)), list(may.parameters.values()), slopes)
+        return self.plant.rates(jax.tree.unflatten(structure, worst), at.x, jnp.where(push > 0, high, low))
 
 
 @final
@@ -203,9 +205,19 @@ def scaled_rate(
     motion: RobotRate = closed_form_rate,
 ) -> Float[Array, "n *batch"]:
     """x' of the robot whose design fields and constants of these names are scaled."""
+    return motion(*_scaled_robot(plant, design, scales), x, u)
+
+
+def scaled_numbers(plant: Plant, design: eqx.Module, scales: Scales) -> PyTree:
+    """What `plant.rates` needs of the robot whose design fields and constants of these names are scaled."""
+    plant, design = _scaled_robot(plant, design, scales)
+    return plant.lumped(design)
+
+
+def _scaled_robot(plant: Plant, design: eqx.Module, scales: Scales) -> tuple[Plant, eqx.Module]:
     in_design = {name: scale for name, scale in scales.items() if hasattr(design, name)}
     in_plant = {name: scale for name, scale in scales.items() if name not in in_design}
-    return motion(_scaled(plant, in_plant), _scaled(design, in_design), x, u)
+    return _scaled(plant, in_plant), _scaled(design, in_design)
 
 
 def _scaled(part: Part, scales: dict[str, Any]) -> Part:
@@ -215,6 +227,37 @@ def _scaled(part: Part, scales: dict[str, Any]) -> Part:
     return eqx.tree_at(lambda part: [getattr(part, name) for name in scales], part, values)
 
 
+def _corner(numbers: Callable[[Sequence], list], widths: Sequence[Array], slopes: Sequence[Array]) -> list[Array]:
+    """The numbers at that corner of the box of factors 1 -+ widths where slopes . numbers is largest, to first order.
+
+    `numbers(factors)` are scalars, the slopes are of many states. A number is computed once at every corner of the
+    factors on which it depends, and picked for each state.
+    """
+    one = jnp.ones(())
+    depends, raised = [], []
+    for i in range(len(widths)):
+        along = partial(lambda i, factor: numbers([factor if i == j else 1.0 for j in range(len(widths))]), i)
+        depends.append(dependent(along, one))
+        _, rates = jax.jvp(along, (one,), (one,))
+        terms = zip(slopes, rates, depends[i], strict=True)
+        raised.append(sum(slope * rate for slope, rate, present in terms if present) > 0)
+
+    @cache
+    def at(*signs: int) -> list:
+        return numbers([1 + sign * width for sign, width in zip(signs, widths, strict=True)])
+
+    def picked(k: int, *signs: int) -> Array:
+        """The k-th number, the signs of the first parameters being these."""
+        i = len(signs)
+        if i == len(widths):
+            return at(*signs)[k]
+        if not depends[i][k]:
+            return picked(k, *signs, 0)
+        return jnp.where(raised[i], picked(k, *signs, 1), picked(k, *signs, -1))
+
+    return [picked(k) for k in range(len(slopes))]
+
+
 def _times(matrix, vector) -> Array:
     """Product elementwise over all axes behind the first two."""
-    return jnp.stack([matrix[:, i] * vector[i] for i in range(matrix.shape[1])]).sum(0)
+    return cast(Array, sum(matrix[:, i] * component for i, component in enumerate(vector)))

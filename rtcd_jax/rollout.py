@@ -20,7 +20,7 @@ from rtcd_jax.adversary import Drawn, Opponent, Situation
 from rtcd_jax.config.schema import FunnelConfig
 from rtcd_jax.numerics.batched import mm, spectral_radius
 from rtcd_jax.numerics.integrate import END, MIDDLE, STABLE, START, rk4_varying_step, split
-from rtcd_jax.numerics.loops import short_scan
+from rtcd_jax.numerics.loops import on_gpu, short_scan
 from rtcd_jax.plants.base import Plant
 from rtcd_jax.policy import inputs_at_knots, linearize, nominal
 from rtcd_jax.problem import Problem
@@ -42,8 +42,8 @@ class Dynamics(NamedTuple):
 
 
 def closed_form(plant: Plant, opponent: Opponent | None = None) -> Dynamics:
-    """The plant's own equations."""
-    return Dynamics(plant.dynamics, large=False, opponent=opponent)
+    """The plant's own equations. A CPU's compiler would repeat what an opponent chooses at one stage in the next."""
+    return Dynamics(plant.dynamics, large=opponent is not None and not on_gpu(), opponent=opponent)
 
 
 def mjx(plant: Plant, drawn: Drawn | None = None) -> Dynamics:

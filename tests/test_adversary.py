@@ -16,9 +16,10 @@ import yaml
 from rtcd_jax import rollout
 from rtcd_jax.adversary import Drawn, Situation, Worst, closed_form_rate, scaled_rate
 from rtcd_jax.config import load as configuration
+from rtcd_jax.config.packaged import packaged
 from rtcd_jax.evaluation import search_budget
 from rtcd_jax.funnel import MARGIN, estimate_funnel
-from rtcd_jax.problem import Problem
+from rtcd_jax.problem import Problem, make_problem
 from rtcd_jax.types import Candidate, Policy, Status, Trajectory, Uncertainty
 from rtcd_jax.validation import Dynamics, Rollouts, SamplingBudget, validate_paths
 from tests import pipeline
@@ -153,6 +154,33 @@ def test_what_the_greedy_adversary_misses_is_of_second_order():
     assert np.all(whole >= -1e-14)
     assert np.max(whole) > 1e-4
     assert np.max(half) < 0.35 * np.max(whole)
+
+
+@jax.jit
+def worst_and_greedy(plant, design, may: Uncertainty, at: Situation) -> tuple[jax.Array, jax.Array]:
+    """x' of the adversary; and by the signs of V's slope in every number and input of every state, found without it."""
+    x, slope = jnp.stack(at.x), jnp.einsum("ij...,j...->i...", at.cost, jnp.stack(at.error))
+    low, high = (jnp.clip(at.asked, -at.bounds, at.bounds) + side * may.input for side in (-1, 1))
+    ones = {name: jnp.ones_like(x[0]) for name in may.parameters}
+    power = lambda scales, u: jnp.sum(slope * scaled_rate(plant, design, scales, x, u))  # noqa: E731
+    slopes, push = jax.grad(power, (0, 1))(ones, (low + high) / 2)
+    scales = {name: 1 + width * jnp.sign(slopes[name]) for name, width in may.parameters.items()}
+    expected = scaled_rate(plant, design, scales, x, jnp.where(push > 0, high, low))
+    return jnp.stack(Worst(plant, may).rate(design, at)), expected
+
+
+def test_the_corner_is_that_of_the_slopes_in_the_numbers_themselves():
+    """A cart-pole, whose numbers are lumped together in many ways."""
+    problem = make_problem(configuration.load(packaged()["cartpole_rtcd"]))
+    plant, rng = problem.plant, np.random.default_rng(1)
+    design = plant.Design(*map(jnp.asarray, (0.2, 0.25)))
+    x, error = jnp.asarray(rng.uniform(-2, 2, (4, 200))), jnp.asarray(rng.normal(scale=0.3, size=(4, 200)))
+    half = rng.normal(size=(4, 4))
+    arrays = rng.uniform(-9, 9, (1, 200)), rng.normal(size=(1, 4, 200)), (half @ half.T)[..., None]
+    at = Situation(tuple(x), list(error), *map(jnp.asarray, arrays), jnp.zeros((4, 200)), jnp.full((1, 200), 6.0))
+    names = {"pole_mass": 0.1, "pole_length": 0.1, "cart_mass": 0.05, "cart_damping": 0.2, "pivot_damping": 0.3}
+    worst, expected = worst_and_greedy(plant, design, uncertainty(noise=(0.0,) * 4, input=0.3, **names), at)
+    np.testing.assert_allclose(worst, expected, rtol=1e-12, atol=1e-12)
 
 
 @partial(jax.jit, static_argnames="motion")

@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterable
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jax.extend.core import Literal, jaxpr_as_fun
+from jax.extend.core import ClosedJaxpr, Literal, jaxpr_as_fun
 from jaxtyping import PyTree
 
 from rtcd_jax.numerics.loops import on_gpu
@@ -50,20 +50,31 @@ def held(entries: PyTree, one: jax.Array) -> PyTree:
     return eqx.combine(jax.tree.map(lambda entry: entry / one, arrays), numbers)
 
 
+def dependent(f: Callable, *args: PyTree) -> list[bool]:
+    """For every output of f, whether any operation before it takes an argument."""
+    return _traced(f, *args)[1]
+
+
 def known(f: Callable, *args: PyTree) -> list[float | None]:
     """For every output of f, its value if it does not depend on the arguments, else None.
 
     `args` are pytrees of scalars or of their shapes. An output depends on what any operation before it depends on.
     """
-    jaxpr = jax.make_jaxpr(f)(*args)
-    dependent = set(jaxpr.jaxpr.invars)
-    touched = lambda atom: not isinstance(atom, Literal) and atom in dependent  # noqa: E731
-    for equation in jaxpr.eqns:
-        if any(touched(atom) for atom in equation.invars):
-            dependent.update(equation.outvars)
+    jaxpr, touched = _traced(f, *args)
     with jax.ensure_compile_time_eval():
         values = jaxpr_as_fun(jaxpr)(*(jnp.ones(v.aval.shape, v.aval.dtype) for v in jaxpr.jaxpr.invars))
-    return [None if touched(atom) else float(v) for atom, v in zip(jaxpr.jaxpr.outvars, values, strict=True)]
+    return [None if depends else float(v) for depends, v in zip(touched, values, strict=True)]
+
+
+def _traced(f: Callable, *args: PyTree) -> tuple[ClosedJaxpr, list[bool]]:
+    """The program of f, and which of its outputs depend on the arguments."""
+    jaxpr = jax.make_jaxpr(f)(*args)
+    reached = set(jaxpr.jaxpr.invars)
+    touched = lambda atom: not isinstance(atom, Literal) and atom in reached  # noqa: E731
+    for equation in jaxpr.eqns:
+        if any(touched(atom) for atom in equation.invars):
+            reached.update(equation.outvars)
+    return jaxpr, [touched(atom) for atom in jaxpr.jaxpr.outvars]
 
 
 def unstacked(f: Callable) -> Callable:

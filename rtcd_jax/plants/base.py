@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from typing import ClassVar
 
 import equinox as eqx
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, PyTree
 
 Components = tuple[Float[Array, "*batch"], ...]
 """The rows of a state or an input, not stacked to one array: programs of single numbers keep them apart."""
@@ -49,6 +49,17 @@ class Plant(eqx.Module):
         self, design: eqx.Module, x: Float[Array, "n *batch"] | Components, u: Float[Array, "m *batch"] | Components
     ) -> Float[Array, "n *batch"]:
         """State derivative in SI units per second; the design's leaves are broadcast to the states' trailing axes."""
+
+    def lumped(self, design: eqx.Module) -> PyTree:
+        """What `rates` needs of this robot: numbers that depend on no state."""
+        return self, design
+
+    def rates(
+        self, numbers: PyTree, x: Float[Array, "n *batch"] | Components, u: Float[Array, "m *batch"] | Components
+    ) -> Components:
+        """The components of the state derivative, from `lumped` numbers."""
+        plant, design = numbers
+        return tuple(plant.dynamics(design, x, u))
 
     @abc.abstractmethod
     def motor_speeds(self, design: eqx.Module, x: Float[Array, "n *batch"]) -> Float[Array, "m *batch"]:

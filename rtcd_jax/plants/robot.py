@@ -6,7 +6,7 @@ from typing import Any, ClassVar, cast
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, PyTree
 
 from rtcd_jax.config.robot import OPTION, Robot, Value, value_of
 from rtcd_jax.numerics.trigonometry import cos, sin
@@ -29,11 +29,19 @@ class MjcfPlant(Plant):
     def dynamics(
         self, design: eqx.Module, x: Float[Array, "n *batch"] | Components, u: Float[Array, "m *batch"] | Components
     ) -> Float[Array, "n *batch"]:
+        return jnp.stack(self.rates(self.lumped(design), x, u))
+
+    def lumped(self, design: eqx.Module) -> PyTree:
+        return closed_form(self.robot).lump(self._numbers(design))
+
+    def rates(
+        self, numbers: PyTree, x: Float[Array, "n *batch"] | Components, u: Float[Array, "m *batch"] | Components
+    ) -> Components:
         form, nv = closed_form(self.robot), len(self.robot.joints)
         q, v = x[:nv], x[nv:]
-        rates = form.program.accelerations(form.lump(self._numbers(design)), q, v, u, sin, cos)
-        shape = jnp.broadcast_shapes(*map(jnp.shape, (*v, *rates)))
-        return jnp.stack([jnp.broadcast_to(jnp.asarray(rate, x[0].dtype), shape) for rate in (*v, *rates)])
+        rates = (*v, *form.program.accelerations(numbers, q, v, u, sin, cos))
+        shape = jnp.broadcast_shapes(*map(jnp.shape, rates))
+        return tuple(jnp.broadcast_to(jnp.asarray(rate, x[0].dtype), shape) for rate in rates)
 
     def motor_speeds(self, design: eqx.Module, x: Float[Array, "n *batch"]) -> Float[Array, "m *batch"]:
         form, nv = closed_form(self.robot), len(self.robot.joints)
