@@ -351,7 +351,9 @@ class CertifyOptions(Options):
         gt=0,
         le=1,
     )
-    workers: int = Field(default=0, description="processes, one elite each; 0 for one a core [-]", ge=0)
+    workers: int = Field(
+        default=0, description="processes, one an elite; its programs share the rest; 0: cores [-]", ge=0
+    )
 
 
 def certify(options: CertifyOptions, console: Console) -> Exit:

@@ -286,6 +286,15 @@ def test_a_killed_search_goes_on_to_the_same_certificate(tmp_path, optimized):
 
 
 @pytest.mark.thorough
+def test_threads_share_out_the_cases_and_change_nothing(tmp_path):
+    one, three = folder_of(tmp_path / "one"), folder_of(tmp_path / "three")
+    elite.certify_elite(one, "000", "proved", lambda step: None)
+    elite.certify_elite(three, "000", "proved", lambda step: None, threads=3)
+    files = [(run / "certificates" / "000.json").read_bytes() for run in (one, three)]
+    assert files[0] == files[1]
+
+
+@pytest.mark.thorough
 def test_another_elite_s_journal_is_not_used(tmp_path):
     run = folder_of(tmp_path)
     journal = run / "certificates" / ".000.partial.jsonl"

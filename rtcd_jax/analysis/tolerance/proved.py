@@ -11,6 +11,7 @@ from rtcd_jax.certificate.prove.certify import Checking, Step, certify_elite
 from rtcd_jax.config.schema import UncertaintyConfig
 from rtcd_jax.elite.records import elite_digests
 from rtcd_jax.system.console import Clock, Console, Progress, duration
+from rtcd_jax.system.devices import cores
 from rtcd_jax.system.files import make_folder, replace
 from rtcd_jax.system.journal import Journal
 
@@ -57,7 +58,7 @@ def proved_factor(
             text = f"factor {factor:.3g}: interval {step.knot + 1}/{step.knots}  elapsed {duration(clock.elapsed)}"
             console.progress(Progress(step.knots - step.knot, step.knots, text))
 
-        outcome = certify_elite(run, name, "proved", tell, uncertainty=box.times(factor), target=tried)
+        outcome = certify_elite(run, name, "proved", tell, uncertainty=box.times(factor), target=tried, threads=cores())
         if outcome is None or not outcome.whole:
             return None
         replace(best, (run / tried / f"{name}.json").read_bytes())

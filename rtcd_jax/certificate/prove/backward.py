@@ -9,7 +9,9 @@ more than it needs, the interval is proved once more with a lower decay margin.
 import itertools
 import math
 from collections.abc import Iterator, Mapping
+from concurrent.futures import Executor
 from functools import cache
+from threading import Event
 from typing import Any, NamedTuple, cast, final
 
 import numpy as np
@@ -27,7 +29,7 @@ DECAY_MARGINS = {
     4: (0.02, 0.05, 0.1, 0.2, 0.5, 1.5, 4.0, 10.0, 25.0),
 }
 """By the number of states: decay margins [1/s] in the order of trial."""
-LARGEST = {2: 0.1, 4: 0.06}
+LARGEST = {2: 0.1, 4: 0.1}
 """Decay margin [1/s] beyond which an interval is halved rather; of a part, over its length. The shortest have all."""
 RECLAIMED = 0.8
 """Share of the certificates' margin by which the decay margin is lowered."""
@@ -160,8 +162,10 @@ class ProofState(NamedTuple):
 class BackwardProof:
     """The proof of one elite's funnel. `exact` runs the checker after every interval (*proved*)."""
 
-    def __init__(self, claim: Claim, loop: Loop, exact: bool, solver: str = program.SOLVER):
-        self.claim, self.loop, self.exact, self.solver = claim, loop, exact, solver
+    def __init__(
+        self, claim: Claim, loop: Loop, exact: bool, solver: str = program.SOLVER, pool: Executor | None = None
+    ):
+        self.claim, self.loop, self.exact, self.solver, self.pool = claim, loop, exact, solver, pool
         self._directions, self._rates = unit_directions(claim.n), DECAY_MARGINS[claim.n]
         self._tiers, self._degrees = tiers_of(claim.n, moving(claim)), degrees_of(claim)
 
@@ -220,7 +224,7 @@ class BackwardProof:
             interval, todo, shapes = self._models(interval, decay_margin)
             if self.claim.shifts and k % FROM_THE_CHEAPEST:  # of their many programs
                 shapes = {case: _from(each, state.sizes.get(case, (0, 0))) for case, each in shapes.items()}
-            proof = prove(todo, shapes, decay_margin, self.exact, self._directions, self.solver)
+            proof = prove(todo, shapes, decay_margin, self.exact, self._directions, self.solver, self.pool)
         except Refused:
             return None
         if proof is None:
@@ -281,11 +285,12 @@ def prove(
     exact: bool,
     directions: np.ndarray,
     solver: str,
+    pool: Executor | None = None,
 ) -> tuple[dict[str, GramCertificate], float] | None:
     """Gram certificates by case and the least margin; None where a case has none. `exact`: the checker's margin.
 
     A case is shown by the first of its shapes with a margin of `enough`, or else by the last. The `directions` [n D]
-    are tried before a program is solved.
+    are tried before a program is solved. The threads of a `pool` share the cases out, the hardest first.
 
     Raises:
         Refused: the checker does not accept a certificate of the solver's.
@@ -299,19 +304,31 @@ def prove(
     hardest = {case: sampled(case, shapes[case][-1])[1] for case in todo}
     if min(hardest.values()) <= 0:
         return None
-    certificates, least = {}, np.inf
-    for case in sorted(todo, key=hardest.__getitem__):
+    ended = Event()
+
+    def shown(case: str) -> tuple[GramCertificate, float] | None:
         solution = None
         for shape in shapes[case]:
             needed = 0 if shape is shapes[case][-1] else enough
             data, lowest = sampled(case, shape)
-            if lowest > needed:
+            if lowest > needed and not ended.is_set():
                 solution = program.solve(data, shape, solver)
                 if solution is not None and solution.margin > needed:
                     break
         if solution is None:
+            ended.set()
             return None
-        certificates[case] = solution.certificate
-        margin = float(cast(Any, check.margin(todo[case], solution.certificate, case))) if exact else solution.margin
-        least = min(least, margin)
+        certificate = solution.certificate
+        return certificate, float(cast(Any, check.margin(todo[case], certificate, case))) if exact else solution.margin
+
+    certificates, least = {}, np.inf
+    order = sorted(todo, key=hardest.__getitem__)
+    try:
+        for case, found in zip(order, (pool.map if pool else map)(shown, order), strict=True):
+            if found is None:
+                return None
+            certificates[case] = found[0]
+            least = min(least, found[1])
+    finally:
+        ended.set()
     return {case: certificates[case] for case in todo}, least

@@ -7,6 +7,7 @@ import math
 import re
 import time
 from collections.abc import Callable, Mapping
+from concurrent.futures import Executor, ThreadPoolExecutor
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -92,21 +93,26 @@ def certify_elite(
     solver: str = SOLVER,
     share: float = 1.0,
     target: str = "certificates",
+    threads: int = 1,
 ) -> Outcome | None:
     """Writes NAME.json into a run's folder `target`; None if not even a goal region can be shown.
 
     `optimize_value` chooses the ellipsoids' shapes so that the funnel is large. The certificate bears what the run
     bore, or another `uncertainty`, or that of a file. `solver` is by cvxpy's name. With a `share` below 1 no level is
-    above so much of the sampled ones. A certificate that is there already, of the same claim in the same way, is not
-    made again.
+    above so much of the sampled ones. The `threads` share out the cases of an interval. A certificate that is there
+    already, of the same claim in the same way, is not made again.
 
     Raises:
         UserError: an elite that is not there, or of a plant that the checker does not know, or that another process is
             proving.
     """
     lock = run / target / f".{name}.lock"
-    with held(lock, f"elite {name} of {run}", "it is being proved there"), removed(lock):
-        return _certified(run, name, guarantee, on_step, optimize_value, uncertainty, solver, share, target)
+    with held(lock, f"elite {name} of {run}", "it is being proved there"), removed(lock), _pool(threads) as pool:
+        return _certified(run, name, guarantee, on_step, optimize_value, uncertainty, solver, share, target, pool)
+
+
+def _pool(threads: int) -> contextlib.AbstractContextManager[Executor | None]:
+    return ThreadPoolExecutor(threads) if threads > 1 else contextlib.nullcontext()
 
 
 def _certified(
@@ -119,6 +125,7 @@ def _certified(
     solver: str,
     share: float,
     target: str,
+    pool: Executor | None,
 ) -> Outcome | None:
     """`certify_elite` of an elite that no other process is at."""
     began = time.perf_counter()
@@ -148,11 +155,11 @@ def _certified(
     journal = Journal(folder / f".{name}.partial.jsonl", head)
     if optimize_value:
         loop = _shaped(loop, journal)
-    region = _region(claim, loop, exact, bounds.rest, journal, solver)
+    region = _region(claim, loop, exact, bounds.rest, journal, solver, pool)
     if region is None:
         return None
     goal, outlet = region
-    proof = BackwardProof(claim, loop, exact, solver)
+    proof = BackwardProof(claim, loop, exact, solver, pool)
     state = _resumed(proof, claim, outlet, journal)
     for proved in proof.intervals_from(state):
         interval = proved.interval
@@ -233,13 +240,13 @@ def _read(loop_record: Mapping[str, Any], elite: Elite) -> Claim:
 
 
 def _region(
-    claim: Claim, loop: Loop, exact: bool, rest: float, journal: Journal, solver: str
+    claim: Claim, loop: Loop, exact: bool, rest: float, journal: Journal, solver: str, pool: Executor | None
 ) -> tuple[dict[str, Any], float] | None:
     """The goal's record and the outlet's level, from the journal if it has them."""
     for line in journal.lines:
         if "goal" in line:
             return line["goal"], line["outlet"]
-    region = goal_region(claim, loop, exact, rest, solver)
+    region = goal_region(claim, loop, exact, rest, solver, pool)
     if region is None:
         return None
     goal = _goal_record(region)

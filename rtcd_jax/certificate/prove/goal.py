@@ -1,5 +1,6 @@
 """The goal region: the largest level of V about the goal that can be proved under its saturated LQR, for all time."""
 
+from concurrent.futures import Executor
 from typing import NamedTuple
 
 import numpy as np
@@ -44,7 +45,9 @@ class GoalRegion(NamedTuple):
     sides: list
 
 
-def goal_region(claim: Claim, loop: Loop, exact: bool, rest: float = 0.0, solver: str = SOLVER) -> GoalRegion | None:
+def goal_region(
+    claim: Claim, loop: Loop, exact: bool, rest: float = 0.0, solver: str = SOLVER, pool: Executor | None = None
+) -> GoalRegion | None:
     """The region of the first level that can be proved; None if none can.
 
     Where something moves the goal, motions may stay below |y| = `rest`; the least such |y| is looked for.
@@ -56,7 +59,7 @@ def goal_region(claim: Claim, loop: Loop, exact: bool, rest: float = 0.0, solver
         return None
     for fraction in LEVEL_FRACTIONS:
         for tier in TIERS[claim.n]:
-            region, error = _at_level(claim, loop, fraction * most, tier, exact, directions, rest, solver)
+            region, error = _at_level(claim, loop, fraction * most, tier, exact, directions, rest, solver, pool)
             if region is not None:
                 return region
             if error <= SMALL_ERROR:
@@ -73,6 +76,7 @@ def _at_level(
     directions: np.ndarray,
     most_rest: float,
     solver: str,
+    pool: Executor | None,
 ) -> tuple[GoalRegion | None, float]:
     """The region of a level, and the error [1/s] of its models."""
     axes = on_grid(loop.axes(len(loop.u) - 1, 1.0, rho, 0.0)[0])
@@ -88,7 +92,7 @@ def _at_level(
                 todo = check.goal_obligations(claim, field, *ends)
                 error = max(float(each.error) for each in todo.values())
                 shapes = tier.shapes(todo, loop, tier.degree)
-                proof = prove(todo, shapes, ENOUGH, exact, directions, solver)
+                proof = prove(todo, shapes, ENOUGH, exact, directions, solver, pool)
             if proof is not None:
                 shells.append(Shell(*ends, proof[0]))
                 least = min(least, proof[1])

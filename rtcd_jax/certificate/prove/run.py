@@ -1,4 +1,7 @@
-"""`rtcd certify`: elites of a run folder in parallel processes, one line of progress, a table at the end."""
+"""`rtcd certify`: elites of a run folder in parallel processes, one line of progress, a table at the end.
+
+Cores that are left over share out the cases of an elite's intervals.
+"""
 
 import contextlib
 import math
@@ -147,8 +150,9 @@ def _events(
     for library in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
         os.environ.setdefault(library, "1")
     steps = CONTEXT.Queue()
-    with processes(min(workers, len(names)), _remember, steps) as pool:
-        waiting: dict[Future, str] = {pool.submit(_work, folder, name, *how): name for name in names}
+    count = min(workers, len(names))
+    with processes(count, _remember, steps) as pool:
+        waiting: dict[Future, str] = {pool.submit(_work, folder, name, workers // count, *how): name for name in names}
         while waiting:
             with contextlib.suppress(queue.Empty):
                 yield steps.get(timeout=POLL)
@@ -166,8 +170,8 @@ def _remember(steps: Any) -> None:
     _steps = steps
 
 
-def _work(folder: Path, name: str, guarantee: str, *how: Any) -> Outcome | None:
-    return certify_elite(folder, name, guarantee, _steps.put, *how)
+def _work(folder: Path, name: str, threads: int, guarantee: str, *how: Any) -> Outcome | None:
+    return certify_elite(folder, name, guarantee, _steps.put, *how, threads=threads)
 
 
 def rank_correlation(outcomes: Sequence[Outcome]) -> float:

@@ -15,6 +15,7 @@ what a solution is worth.
 import contextlib
 import itertools
 import math
+import threading
 import warnings
 from dataclasses import dataclass
 from functools import lru_cache
@@ -215,12 +216,12 @@ class Program:
         self._p.value = data.p
         for parameter, value in zip(self._g, data.g, strict=True):
             parameter.value = value
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", UserWarning)  # "may be inaccurate": the checker decides
-            try:
-                self.problem.solve(solver=solver, warm_start=False, **OPTIONS.get(solver, {}))
-            except cp.SolverError:
-                return -math.inf
+        # The checker decides. For all threads: a filter of one thread's own is not known before Python 3.14.
+        warnings.filterwarnings("ignore", "Solution may be inaccurate", UserWarning)
+        try:
+            self.problem.solve(solver=solver, warm_start=False, **OPTIONS.get(solver, {}))
+        except cp.SolverError:
+            return -math.inf
         solved = self.problem.status in (cp.OPTIMAL, cp.OPTIMAL_INACCURATE)
         return float(cast(float, self.problem.value)) if solved else -math.inf
 
@@ -231,10 +232,21 @@ class Program:
         return GramCertificate(self._shape.degree, gram, multipliers, self._shape.further)
 
 
-@lru_cache(None)
+@final
+class _Stated(threading.local):
+    def __init__(self):
+        self.programs: dict[Shape, Program] = {}
+
+
+_STATED = _Stated()
+
+
 def program_of(shape: Shape) -> Program:
-    """The program of a shape, stated at its first use."""
-    return Program(shape)
+    """The program of a shape, stated at its first use by each thread."""
+    programs = _STATED.programs
+    if shape not in programs:
+        programs[shape] = Program(shape)
+    return programs[shape]
 
 
 def solve(data: Data, shape: Shape, solver: str = SOLVER) -> Solution | None:
