@@ -29,7 +29,7 @@ DECAY_MARGINS = {
     4: (0.02, 0.05, 0.1, 0.2, 0.5, 1.5, 4.0, 10.0, 25.0),
 }
 """By the number of states: decay margins [1/s] in the order of trial."""
-LARGEST = {2: 0.1, 4: 0.1}
+LARGEST = {2: 0.1, 4: 0.06}
 """Decay margin [1/s] beyond which an interval is halved rather; of a part, over its length. The shortest have all."""
 RECLAIMED = 0.8
 """Share of the certificates' margin by which the decay margin is lowered."""
