@@ -30,7 +30,8 @@ def shown(todo, degree, bernstein=0, multiplier=0, solver=program.SOLVER, furthe
 def largest(todo, degree, bernstein=0, multiplier=0, solver=program.SOLVER, further=()):
     """The program's optimum, of whatever sign."""
     shape = program.shape_of(todo, degree, bernstein, multiplier, further)
-    return program.program_of(shape).margin(program.data_of(todo, shape), solver)
+    with program.program_of(shape) as stated:
+        return stated.margin(program.data_of(todo, shape), solver)
 
 
 def cubic(level):
@@ -167,10 +168,14 @@ def test_another_solver_finds_what_motzkin_lacks():
     assert shown(lifted(0.95 * lack), 3, solver="SCS") is None
 
 
-def test_a_program_is_stated_once_for_all_data_of_its_shape():
+def test_a_program_is_stated_once_for_all_data_of_its_shape_but_where_it_is_in_use():
     shapes = {program.shape_of(cubic(level), 1, 2, 0) for level in (0.3, 0.9, 1.2)}
     assert len(shapes) == 1
-    assert program.program_of(*shapes) is program.program_of(*shapes)
+    with program.program_of(*shapes) as first:
+        with program.program_of(*shapes) as second:
+            assert first is not second
+        with program.program_of(*shapes) as third:
+            assert third is second
     for level in (0.3, 0.9, 1.2):
         assert largest(cubic(level), 1, 2) == pytest.approx(2 - 2 * level, abs=1e-5)
 
@@ -178,7 +183,8 @@ def test_a_program_is_stated_once_for_all_data_of_its_shape():
 def test_the_parameters_enter_so_that_no_program_is_canonicalized_twice():
     """Disciplined parametrized programming, with and without multipliers."""
     for shape in (program.Shape(2, 2, 3, 1, 1), program.Shape(4, 2, 5, 0, 0)):
-        assert program.program_of(shape).problem.is_dcp(dpp=True)
+        with program.program_of(shape) as stated:
+            assert stated.problem.is_dcp(dpp=True)
 
 
 def test_solvers_are_found_by_name_and_those_that_cannot_are_not_offered():

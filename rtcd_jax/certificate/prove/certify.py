@@ -35,6 +35,8 @@ TASK = "task"
 """Note of a certificate: the digest of what was to be proved, and how."""
 ENDING_ZEROS = re.compile(r"\.?0*p")
 """Of a double as certificates write it."""
+MOST_THREADS = 8
+"""Of one elite's proof: few cases take most of an interval's time, and each thread some of the memory."""
 COARSER = 2
 """Stride of the directions for funnels that are not proved yet."""
 
@@ -112,6 +114,7 @@ def certify_elite(
 
 
 def _pool(threads: int) -> contextlib.AbstractContextManager[Executor | None]:
+    threads = min(threads, MOST_THREADS)
     return ThreadPoolExecutor(threads) if threads > 1 else contextlib.nullcontext()
 
 

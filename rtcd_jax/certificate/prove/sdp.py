@@ -15,8 +15,8 @@ what a solution is worth.
 import contextlib
 import itertools
 import math
-import threading
 import warnings
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any, NamedTuple, cast, final
@@ -232,28 +232,30 @@ class Program:
         return GramCertificate(self._shape.degree, gram, multipliers, self._shape.further)
 
 
-@final
-class _Stated(threading.local):
-    def __init__(self):
-        self.programs: dict[Shape, Program] = {}
+_FREE: dict[Shape, list[Program]] = {}
 
 
-_STATED = _Stated()
-
-
-def program_of(shape: Shape) -> Program:
-    """The program of a shape, stated at its first use by each thread."""
-    programs = _STATED.programs
-    if shape not in programs:
-        programs[shape] = Program(shape)
-    return programs[shape]
+@contextlib.contextmanager
+def program_of(shape: Shape) -> Iterator[Program]:
+    """The program of a shape for one thread, stated anew only where all that there are of it are in use: the large
+    ones have 0.4 GB.
+    """
+    free = _FREE.setdefault(shape, [])
+    try:
+        program = free.pop()
+    except IndexError:
+        program = Program(shape)
+    try:
+        yield program
+    finally:
+        free.append(program)
 
 
 def solve(data: Data, shape: Shape, solver: str = SOLVER) -> Solution | None:
     """The best Gram certificate by a solver of cvxpy's; None where it has none, or no positive margin."""
-    program = program_of(shape)
-    margin = program.margin(data, solver)
-    return Solution(margin, program.certificate()) if margin > 0 else None
+    with program_of(shape) as program:
+        margin = program.margin(data, solver)
+        return Solution(margin, program.certificate()) if margin > 0 else None
 
 
 def require_solver(name: str) -> str:
