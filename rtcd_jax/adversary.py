@@ -233,12 +233,15 @@ def _corner(numbers: Callable[[Sequence], list], widths: Sequence[Array], slopes
     `numbers(factors)` are scalars, the slopes are of many states. A number is computed once at every corner of the
     factors on which it depends, and picked for each state.
     """
-    one = jnp.ones(())
-    depends, raised = [], []
-    for i in range(len(widths)):
-        along = partial(lambda i, factor: numbers([factor if i == j else 1.0 for j in range(len(widths))]), i)
-        depends.append(dependent(along, one))
-        _, rates = jax.jvp(along, (one,), (one,))
+    one, count = jnp.ones(()), len(widths)
+
+    def along(i: int, factor: Array) -> list:
+        return numbers([factor if i == j else 1.0 for j in range(count)])
+
+    depends = [dependent(partial(along, i), one) for i in range(count)]
+    raised = []
+    for i in range(count):
+        _, rates = jax.jvp(partial(along, i), (one,), (one,))
         terms = zip(slopes, rates, depends[i], strict=True)
         raised.append(sum(slope * rate for slope, rate, present in terms if present) > 0)
 
@@ -249,7 +252,7 @@ def _corner(numbers: Callable[[Sequence], list], widths: Sequence[Array], slopes
     def picked(k: int, *signs: int) -> Array:
         """The k-th number, the signs of the first parameters being these."""
         i = len(signs)
-        if i == len(widths):
+        if i == count:
             return at(*signs)[k]
         if not depends[i][k]:
             return picked(k, *signs, 0)
