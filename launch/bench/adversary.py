@@ -13,6 +13,7 @@ from measure import RESULTS, as_script, environment, measure_pipeline, save
 
 from rtcd_jax.config.load import load, parse, resolved
 from rtcd_jax.system.errors import UserError
+from rtcd_jax.system.files import make_folder
 
 CONFIG = Path(__file__).parents[2] / "configs" / "pendulum_robust.yaml"
 PARTS = "input", "input_limit", "age", "plant", "design"
@@ -34,6 +35,7 @@ def main() -> None:
     stated = load(options.config)
     if stated.uncertainty.empty:
         raise UserError(f"{options.config}: states no uncertainty")
+    make_folder(options.results)  # before minutes of work that could not be written
     config = resolved(stated)
     box = config.pop("uncertainty")
     boxes = {"nothing": {}} | {name: {name: box[name]} for name in PARTS if box[name]} | {"all": box}

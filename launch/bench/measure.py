@@ -15,6 +15,7 @@ from rtcd_jax.analysis.scale.clock import Timed, peak_memory, timed
 from rtcd_jax.config.load import Config, load
 from rtcd_jax.system.devices import prepare_jax
 from rtcd_jax.system.errors import UserError
+from rtcd_jax.system.files import make_folder
 
 RESULTS = Path(__file__).parent / "results"
 CONFIG = Path(__file__).parents[2] / "configs" / "pendulum_rtcd.yaml"
@@ -40,7 +41,7 @@ def cpu_model() -> str:
 
 
 def save(name: str, record: dict[str, Any], folder: Path = RESULTS) -> Path:
-    folder.mkdir(parents=True, exist_ok=True)
+    make_folder(folder)
     path = folder / name
     path.write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")
     return path
