@@ -143,18 +143,48 @@ def test_reduction_to_the_sphere():
     assert [len(check.monomials(n, d)) for n, d in ((2, 3), (4, 2), (4, 3))] == [7, 14, 30]
 
 
-def test_bernstein_parts_are_the_polynomial():
-    p = polynomial(2, {(3, 1, 0): Q(2), (1, 0, 2): Q(-1), (0, 0, 0): Q(1, 3)})
-    low, high = Q(1, 4), Q(3, 2)
-    parts = check.bernstein(p, 5, low, high, "x")
-    y = np.array([0.6, 0.8])
+IN_TIME = polynomial(2, {(3, 1, 0): Q(2), (1, 0, 2): Q(-1), (0, 0, 0): Q(1, 3), (2, 3, 1): Q(5)})
+LOW, HIGH = Q(1, 4), Q(3, 2)
+
+
+def by_parts(parts, s, y):
+    t, degree = (s - float(LOW)) / float(HIGH - LOW), len(parts) - 1
+    values = [sum(float(c) * y[0] ** e[0] * y[1] ** e[1] for e, c in part.items()) for part in parts]
+    return sum(math.comb(degree, j) * t**j * (1 - t) ** (degree - j) * each for j, each in enumerate(values))
+
+
+def on_circle(count):
+    for angle in np.linspace(0, 2 * np.pi, count):
+        yield np.array([np.cos(angle), np.sin(angle)])
+
+
+@pytest.mark.parametrize("degree", [3, 5])
+def test_bernstein_parts_are_the_polynomial(degree):
+    parts, error = check.bernstein(IN_TIME, degree, LOW, HIGH)
+    assert error == 0
     for s in np.linspace(0.25, 1.5, 7):
-        t = (s - 0.25) / 1.25
-        total = 0.0
-        for j, part in enumerate(parts):
-            here = sum(float(c) * y[0] ** e[0] * y[1] ** e[1] for e, c in part.items())
-            total += math.comb(5, j) * t**j * (1 - t) ** (5 - j) * here
-        assert total == pytest.approx(value(p, s, y), abs=1e-12)
+        assert by_parts(parts, s, [0.6, 0.8]) == pytest.approx(value(IN_TIME, s, [0.6, 0.8]), abs=1e-12)
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2])
+def test_bernstein_parts_of_too_low_a_degree_are_within_their_error(degree):
+    parts, error = check.bernstein(IN_TIME, degree, LOW, HIGH)
+    assert len(parts) == degree + 1
+    apart = [
+        abs(by_parts(parts, s, y) - value(IN_TIME, s, y)) for s in np.linspace(0.25, 1.5, 41) for y in on_circle(41)
+    ]
+    assert 0.3 * float(error) < max(apart) <= float(error) + 1e-12
+    above = check.condition(IN_TIME, 2, degree, LOW, HIGH)
+    for s in np.linspace(0.25, 1.5, 41):
+        assert all(by_parts(above, s, y) >= value(IN_TIME, s, y) - 1e-12 for y in on_circle(9))
+
+
+def test_what_is_cut_are_the_chebyshev_polynomials():
+    """s^2 = (1 + T_2) / 2 and s^3 = (3 s + T_3) / 4 on [-1, 1]."""
+    square, cube = (polynomial(1, {(k, 0): Q(1)}) for k in (2, 3))
+    assert check.bernstein(square, 1, Q(-1), Q(1)) == ([{(0,): Q(1, 2)}, {(0,): Q(1, 2)}], Q(1, 2))
+    assert check.bernstein(cube, 1, Q(-1), Q(1)) == ([{(0,): Q(-3, 4)}, {(0,): Q(3, 4)}], Q(1, 4))
+    assert check.bernstein(square, 1, Q(0), Q(1))[1] == Q(1, 8)
 
 
 def test_positive_definite_matrices():

@@ -189,6 +189,14 @@ def test_a_goal_that_is_none_is_refused(content):
     assert "the goal's angle is no multiple of pi" in refusal(resealed(content))
 
 
+def halve(content, times):
+    """A case in halves of halves; the outermost pair."""
+    cases = content["funnel"][0]["cases"]
+    for _ in range(times):
+        cases["free"] = [cases["free"], cases["free"]]
+    return cases["free"]
+
+
 @pytest.mark.parametrize(
     ("changed", "reason"),
     [
@@ -218,6 +226,8 @@ def test_a_goal_that_is_none_is_refused(content):
         (lambda c: c["funnel"][0].update(knot=-1), "funnel[0].knot: must be an integer from 0 to 3"),
         (lambda c: c["funnel"][0].update(orders=[99, 5]), "funnel[0].orders[0]: must be an integer from 1 to 15"),
         (lambda c: c["funnel"][0]["cases"]["free"]["gram"][0].pop(), "gram[0]: has 14 entries, must have 15"),
+        (lambda c: halve(c, 1).pop(), "cases.free: has 1 entries, must have 2"),
+        (lambda c: halve(c, 5), "cases.free[0][0][0][0]: halves the interval more than 4 times"),
         (lambda c: c["goal"].update(axes=[]), "goal.axes: has 0 entries, must have 2"),
     ],
 )

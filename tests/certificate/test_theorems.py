@@ -5,7 +5,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from rtcd_jax.certificate import check
-from rtcd_jax.certificate.check import GramCertificate, Obligation, Q, Refused, polynomial
+from rtcd_jax.certificate.check import GramCertificate, Halves, Obligation, Q, Refused, polynomial
 from rtcd_jax.certificate.prove import sdp as program
 from rtcd_jax.system.errors import UserError
 
@@ -24,7 +24,7 @@ def shown(todo, degree, bernstein=0, multiplier=0, solver=program.SOLVER, furthe
     """The margin that the checker accepts, or None."""
     shape = program.shape_of(todo, degree, bernstein, multiplier, further)
     found = program.solve(program.data_of(todo, shape), shape, solver)
-    return None if found is None else float(check.margin(todo, found.certificate, "theorem"))
+    return None if found.squares is None else float(check.margin(todo, found.squares, "theorem"))
 
 
 def largest(todo, degree, bernstein=0, multiplier=0, solver=program.SOLVER, further=()):
@@ -198,26 +198,51 @@ def test_an_error_is_taken_from_the_margin():
     todo = cubic(0.5)
     shape = program.shape_of(todo, 1, 2, 0)
     found = program.solve(program.data_of(todo, shape), shape)
-    assert float(check.margin(todo, found.certificate, "x")) == pytest.approx(1, abs=1e-5)
-    assert float(check.margin(todo._replace(error=exact(0.25)), found.certificate, "x")) == pytest.approx(
-        0.75, abs=1e-5
-    )
+    assert float(check.margin(todo, found.squares, "x")) == pytest.approx(1, abs=1e-5)
+    assert float(check.margin(todo._replace(error=exact(0.25)), found.squares, "x")) == pytest.approx(0.75, abs=1e-5)
     with pytest.raises(Refused, match=r"x\.gram\[\d\]: proves no decrease: at best -0\.5"):
-        check.margin(todo._replace(error=exact(1.5)), found.certificate, "x")
+        check.margin(todo._replace(error=exact(1.5)), found.squares, "x")
 
 
 def test_indefinite_matrices_are_refused():
     todo = cubic(0.5)
     shape = program.shape_of(todo, 1, 2, 0)
-    found = program.solve(program.data_of(todo, shape), shape).certificate
+    found = program.solve(program.data_of(todo, shape), shape).squares
     gram = [[row[:] for row in matrix] for matrix in found.gram]
     gram[1][0][0] = Q(-1, 1 << 60)
     with pytest.raises(Refused, match=r"x\.gram\[1\]: is not positive definite"):
         check.margin(todo, GramCertificate(found.degree, gram, []), "x")
     with pytest.raises(Refused, match="needs 0 multipliers"):
         check.margin(todo, found._replace(multipliers=[[]]), "x")
-    with pytest.raises(Refused, match="order 2 in time needs more than 2 Bernstein polynomials"):
-        check.margin(todo, found._replace(gram=found.gram[:2]), "x")
+
+
+def test_halves_show_what_the_whole_does_not():
+    """s^2 + 1 / 100 on [-1, 1]: its least Bernstein coefficient is -0.99, on either half it is 0.01."""
+    todo = Obligation(polynomial(1, {(2, 0): Q(1), (0, 0): exact(0.01)}), NOTHING, NOTHING, [], exact(-1), exact(1))
+    shape = program.shape_of(todo, 1, 2, 0)
+    assert largest(todo, 1, 2) == pytest.approx(-0.99, abs=1e-5)
+    first, second = (program.solve(program.data_of(half, shape), shape).squares for half in check.halves_of(todo))
+    assert float(check.margin(todo, Halves(first, second), "x")) == pytest.approx(0.01, abs=1e-5)
+    with pytest.raises(Refused, match=r"x\.gram\[1\]: proves no decrease"):
+        check.margin(todo, first, "x")
+    with pytest.raises(Refused, match=r"x\[0\]\.gram\[2\]: proves no decrease"):
+        check.margin(todo, Halves(second, first), "x")
+    gram = [*second.gram[:2], [[Q(-1), Q(0)], [Q(0), Q(1)]]]
+    with pytest.raises(Refused, match=r"x\[1\]\.gram\[2\]: is not positive definite"):
+        check.margin(todo, Halves(first, second._replace(gram=gram)), "x")
+
+
+def test_a_lower_degree_in_time_costs_what_is_cut():
+    """1 + s^2 / 10 on [-1, 1] by constants: its mean 1.05, up to 0.05."""
+    todo = Obligation(polynomial(1, {(0, 0): Q(1), (2, 0): exact(0.1)}), NOTHING, NOTHING, [], exact(-1), exact(1))
+    assert shown(todo, 1, 0) == pytest.approx(1, abs=1e-5)
+
+
+def test_a_condition_of_a_lower_degree_holds_wherever_it_did():
+    """y >= -0.4 - 0.01 s - 0.04 s^3 allows -0.45. Its cut without what is cut, 0.01 T_3, would allow -0.44 only."""
+    todo = ellipse_in_a_case(-0.4)
+    todo = todo._replace(where=[todo.where[0] + polynomial(2, {(3, 0, 0): exact(0.04)})])
+    assert shown(todo, 2, 3, 1) == pytest.approx(0.05, abs=1e-5)
 
 
 def test_samples_bound_the_margin():

@@ -18,12 +18,12 @@ from rtcd_jax.certificate.falsify.falsify import Part, summed
 from rtcd_jax.certificate.falsify.simulation import Motions
 from rtcd_jax.cli import main as cli
 from tests.certificate.second import first_verdict, program, second_verdict
-from tests.certificate.test_check import leaves, resealed
+from tests.certificate.test_check import halve, leaves, resealed
 from tests.certificate.test_hostile import hostile_files, lines_are_the_checker_s_own
 
 FILES = Path(__file__).parent / "files"
 KINDS = ("version1", "version2_age", "box", "age", "cartpole", "two_joints", "two_joints_box", "box_and_age",
-         "further", "own_motions")  # fmt: skip
+         "further", "own_motions", "halves")  # fmt: skip
 """Certificates of every kind of claim; all but the first two end with the last intervals of a test's elite."""
 
 
@@ -140,10 +140,13 @@ def term_changed(content, dice):
 
 
 def case_changed(content, dice):
-    """A case left out, under another name, or with another's proof; another degree, other monomials, other orders."""
+    """A case left out, under another name, in halves, or with another's proof; another degree, other monomials, other
+    orders.
+    """
     piece = dice.choice([*content["funnel"], *content["goal"]["shells"]])
-    cases, kind = piece["cases"], dice.randrange(6)
+    cases, kind = piece["cases"], dice.randrange(8)
     name, other = dice.choice(list(cases)), dice.choice(list(cases))
+    squares = cases[name]
     if kind == 0:
         del cases[name]
     elif kind == 1:
@@ -151,14 +154,19 @@ def case_changed(content, dice):
     elif kind == 2:
         cases[name], cases[other] = cases[other], cases[name]
     elif kind == 3:
-        cases[name]["degree"] += dice.choice([-1, 1])
-    elif kind == 4 and "further" in cases[name]:
-        dice.choice(cases[name]["further"])[dice.randrange(2)] += dice.choice([-1, 1])
-    elif kind == 4 and "orders" in piece:
-        piece["orders"][dice.randrange(len(piece["orders"]))] += dice.choice([-1, 1])
+        cases[name] = [squares, cases[other]]
+    elif kind == 4 and isinstance(squares, list):
+        squares.pop() if dice.random() < 0.3 else squares.reverse()
     else:
-        matrices = cases[name][dice.choice(["gram", "multipliers"])]
-        if matrices:
+        while isinstance(squares, list):
+            squares = dice.choice(squares)
+        if kind == 5:
+            squares["degree"] += dice.choice([-1, 1])
+        elif kind == 6 and "further" in squares:
+            dice.choice(squares["further"])[dice.randrange(2)] += dice.choice([-1, 1])
+        elif kind == 6 and "orders" in piece:
+            piece["orders"][dice.randrange(len(piece["orders"]))] += dice.choice([-1, 1])
+        elif matrices := squares[dice.choice(["gram", "multipliers"])]:
             matrices.pop() if dice.random() < 0.5 else matrices.reverse()
     return ("proof", "cases")
 
@@ -218,6 +226,15 @@ def judged(kind, rounds, seed, second, path):
 def test_both_judge_mutations_alike(second, tmp_path, kind):
     counts = judged(kind, 3, 1, second, tmp_path / "x.json")
     assert counts["refused"]
+
+
+@pytest.mark.parametrize(("times", "place"), [(4, "free[0][0][0][0].gram[4]"), (5, "free[0][0][0][0]")])
+def test_both_read_halves_of_halves_up_to_a_depth(second, tmp_path, content, times, place):
+    """Proofs of the whole, on its sixteenths."""
+    halve(content, times)
+    one, other = first_verdict(resealed(content)), second_verdict(second, tmp_path / "x.json", content)
+    assert (one.code, one.place) == (other.code, other.place)
+    assert one.place.endswith(place)
 
 
 @pytest.mark.slow

@@ -199,6 +199,8 @@ def test_every_input_lies_between_the_two_laws(content):
     asked = check.Feedback(space.y(0) * Q(4), Q(16), space.poly(0))
     cases = check.cases_of(space, claim, Q(3, 10), Q(1), asked, Q(-1), Q(1))
     assert {name[:-1] for name in cases} == {"free", "high", "low"}
+    assert check.are_joined(["free/0", "low-/0"])
+    assert not check.are_joined(cases)
     dice = np.random.default_rng(0)
     for _ in range(300):
         y = dice.normal(size=2)
@@ -211,6 +213,52 @@ def test_every_input_lies_between_the_two_laws(content):
         limit = dice.uniform(weak, strong)
         u = np.clip(asked, -limit, limit) + dice.uniform(-w, w)
         assert min(laws["-"]) - 1e-12 <= u <= max(laws["+"]) + 1e-12
+
+
+@pytest.mark.parametrize("weak", [2, 3, 4])
+def test_an_uncertain_limit_has_one_free_case(content, weak):
+    """Whatever the limit, u is a mean of inputs of cases that hold; and each of the cases is needed for that."""
+    claim = check.read_claim(check.Node("claim", content["claim"]))
+    claim = claim._replace(limits=(Q(weak), Q(4)), disturbance=Q(0))
+    space = check.Space(2, 2, 2)
+    asked = check.Feedback(space.y(0) * Q(5), Q(25), space.poly(0))
+    cases = check.cases_of(space, claim, Q(0), Q(1, 2), asked, Q(-1), Q(1))
+    ends = {"high", "low"} if weak == 4 else {"high-", "high+", "low-", "low+"}
+    assert set(cases) == {"free"} | ends
+    dice, needed = np.random.default_rng(0), set()
+    for _ in range(1000):
+        y = dice.normal(size=2)
+        y /= np.linalg.norm(y)
+        limit = dice.choice([weak, 4, dice.uniform(weak, 4)])
+        u = np.clip(0.5 + 5 * y[0], -limit, limit)
+        inputs = {
+            name: numeric(case.input, 0.0, y)
+            for name, case in cases.items()
+            if all(numeric(condition, 0.0, y) >= 0 for condition in case.where)
+        }
+        assert min(inputs.values()) - 1e-12 <= u <= max(inputs.values()) + 1e-12
+        for name in inputs:
+            others = [each for other, each in inputs.items() if other != name]
+            if not others or not min(others) - 1e-9 <= u <= max(others) + 1e-9:
+                needed.add(name)
+    assert needed == set(cases)
+
+
+def test_older_files_have_two_free_cases(content):
+    """Each with the conditions of its own law: together those of the one case."""
+    claim = check.read_claim(check.Node("claim", content["claim"]))
+    claim = claim._replace(limits=(Q(2), Q(4)), disturbance=Q(0))
+    space = check.Space(2, 2, 2)
+    asked = check.Feedback(space.y(0) * Q(5), Q(25), space.poly(0))
+    one, two = (check.cases_of(space, claim, Q(0), Q(1, 2), asked, Q(-1), Q(1), joined=j) for j in (True, False))
+    assert set(two) - set(one) == {"free-", "free+"}
+    assert {name: two[name] for name in two.keys() & one.keys()} == {name: one[name] for name in one if name != "free"}
+    for angle in np.linspace(0, 2 * np.pi, 100):
+        y = np.array([np.cos(angle), np.sin(angle)])
+        holds = {
+            name: all(numeric(condition, 0.0, y) >= 0 for condition in case.where) for name, case in (one | two).items()
+        }
+        assert holds["free"] == (holds["free-"] or holds["free+"])
 
 
 def test_the_mass_matrix_must_be_definite_for_all_robots_and_angles():

@@ -19,6 +19,8 @@ MAX_TERMS = 10000
 motions 9520, most of which are zero."""
 MAX_FURTHER = 32
 """Of the monomials of a sum of squares, beside those up to its degree."""
+MOST_HALVINGS = 4
+"""Of an interval in the proof of one of its cases."""
 MAX_BYTES = 1 << 28
 """Of a file; that of the refined cart-pole has 1.7e8."""
 PI = Q(314159265358979323846264338327950288419716939937510, 10**50)

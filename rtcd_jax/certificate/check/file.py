@@ -14,6 +14,7 @@ from rtcd_jax.certificate.check.exact import (
     MAX_FURTHER,
     MAX_ORDER,
     MAX_TERMS,
+    MOST_HALVINGS,
     Damaged,
     Q,
     Refused,
@@ -36,7 +37,7 @@ from rtcd_jax.certificate.check.robot import (
     mass_is_definite,
     numbers_of,
 )
-from rtcd_jax.certificate.check.squares import GramCertificate, monomials
+from rtcd_jax.certificate.check.squares import GramCertificate, Halves, Squares, monomials
 from rtcd_jax.certificate.check.version1 import PLANTS
 
 MAX_NOTES = 20
@@ -320,26 +321,29 @@ def _read_term(node: Node, kinds: Sequence[str]) -> Term:
     return Term(places, by_name, cosine.number(), sine.number())
 
 
-def read_cases(node: Node, n: int) -> dict[str, GramCertificate]:
+def read_cases(node: Node, n: int) -> dict[str, Squares]:
     node.require(isinstance(node.value, dict) and all(map(_CASE.fullmatch, node.value)), "must be cases")
-    cases = {}
-    for case, value in node.value.items():
-        here = Node(f"{node.place}.{case}", value)
-        holds = isinstance(value, dict) and value.keys() - {"further"} == {"degree", "gram", "multipliers"}
-        here.require(holds, "must have the keys degree, gram, multipliers, and may have further")
-        degree = Node(f"{here.place}.degree", value["degree"]).integer(1, MAX_ORDER // 2)
-        further = _read_monomials(Node(f"{here.place}.further", value["further"]), n) if "further" in value else ()
-        rows, sides = len(monomials(n, degree)) + len(further), len(monomials(n, degree - 1))
-        grams = Node(f"{here.place}.gram", value["gram"]).items(at_least=1)
-        grams[0].require(len(grams) <= 2 * MAX_ORDER, f"must have at most {2 * MAX_ORDER} matrices")
-        multipliers = Node(f"{here.place}.multipliers", value["multipliers"]).items()
-        cases[case] = GramCertificate(
-            degree,
-            [gram.symmetric(rows) for gram in grams],
-            [[matrix.symmetric(sides) for matrix in each.items(at_least=1)] for each in multipliers],
-            further,
-        )
-    return cases
+    return {case: _read_squares(Node(f"{node.place}.{case}", value), n) for case, value in node.value.items()}
+
+
+def _read_squares(node: Node, n: int, halvings: int = 0) -> Squares:
+    if isinstance(node.value, list):
+        node.require(halvings < MOST_HALVINGS, f"halves the interval more than {MOST_HALVINGS} times")
+        return Halves(*(_read_squares(half, n, halvings + 1) for half in node.items(2)))
+    holds = isinstance(node.value, dict) and node.value.keys() - {"further"} == {"degree", "gram", "multipliers"}
+    node.require(holds, "must have the keys degree, gram, multipliers, and may have further; or be a list of halves")
+    value = {key: Node(f"{node.place}.{key}", each) for key, each in node.value.items()}
+    degree = value["degree"].integer(1, MAX_ORDER // 2)
+    further = _read_monomials(value["further"], n) if "further" in value else ()
+    rows, sides = len(monomials(n, degree)) + len(further), len(monomials(n, degree - 1))
+    grams = value["gram"].items(at_least=1)
+    grams[0].require(len(grams) <= 2 * MAX_ORDER, f"must have at most {2 * MAX_ORDER} matrices")
+    return GramCertificate(
+        degree,
+        [gram.symmetric(rows) for gram in grams],
+        [[matrix.symmetric(sides) for matrix in each.items(at_least=1)] for each in value["multipliers"].items()],
+        further,
+    )
 
 
 def _read_monomials(node: Node, n: int) -> tuple[tuple[int, ...], ...]:

@@ -17,8 +17,8 @@ from rtcd_jax.certificate.check.delay import Bounds as DelayBounds
 from rtcd_jax.certificate.check.exact import Q, alternating, near, require, rounded
 from rtcd_jax.certificate.check.keep_out import half_spaces
 from rtcd_jax.certificate.check.matrix import cofactors, dot
-from rtcd_jax.certificate.check.saturation import Case, Feedback, cases_of, input_error
-from rtcd_jax.certificate.check.squares import GramCertificate, Obligation, control_points, economized, is_positive
+from rtcd_jax.certificate.check.saturation import Case, Feedback, are_joined, cases_of, input_error
+from rtcd_jax.certificate.check.squares import Obligation, Squares, control_points, economized, is_positive
 from rtcd_jax.certificate.check.taylor import Space, Taylor, polynomial, sine_and_cosine, terms_of
 
 WHOLE = {0: (Q(-1), Q(1))}
@@ -64,7 +64,7 @@ class Interval(NamedTuple):
     last: list
     bend: list
     orders: tuple[int, ...]
-    cases: dict[str, GramCertificate]
+    cases: dict[str, Squares]
     late: list
     """rho of delay.py at both ends, linear in between, where old measurements count to first order."""
     sides: list = []  # noqa: RUF012 (of a tuple's field)
@@ -149,7 +149,9 @@ def funnel_models(claim: Claim, interval: Interval, place: str) -> dict[str, tup
         require_delay(claim, bounds, place)
         late = lateness(claim, late, bounds.misfit, jumps_within_reach(claim, interval.knot, interval.start))
         oldest = feedback([gain - row_i * claim.age for row_i, gain in zip(row, data.gain, strict=True)])
-    cases = cases_of(space, claim, late, data.input, feedback(data.gain), Q(-1), Q(1), oldest)
+    cases = cases_of(
+        space, claim, late, data.input, feedback(data.gain), Q(-1), Q(1), oldest, are_joined(interval.cases)
+    )
     return {name: (case, (free + forced * Taylor(free.space, case.input)) * Q(-1)) for name, case in cases.items()}
 
 

@@ -2,6 +2,7 @@
 
 import itertools
 import math
+from collections.abc import Iterable
 from typing import Any, NamedTuple
 
 from rtcd_jax.certificate.check.claim import Claim
@@ -19,8 +20,8 @@ from rtcd_jax.certificate.check.funnel import (
     speed_of,
 )
 from rtcd_jax.certificate.check.matrix import cofactors, dot
-from rtcd_jax.certificate.check.saturation import Feedback, cases_of, error_under
-from rtcd_jax.certificate.check.squares import GramCertificate, Obligation, basis_change, is_positive_definite
+from rtcd_jax.certificate.check.saturation import Feedback, are_joined, cases_of, error_under
+from rtcd_jax.certificate.check.squares import Obligation, Squares, basis_change, is_positive_definite
 from rtcd_jax.certificate.check.taylor import Taylor, terms_of
 
 MOST_TURNS = 10**6
@@ -32,7 +33,7 @@ class Shell(NamedTuple):
 
     start: Any
     end: Any
-    cases: dict[str, GramCertificate]
+    cases: dict[str, Squares]
 
 
 class GoalField(NamedTuple):
@@ -105,8 +106,11 @@ def waves_at_goal(claim: Claim, place: str) -> dict[tuple[int, ...], tuple[Any, 
     return values
 
 
-def goal_obligations(claim: Claim, field: GoalField, low, high) -> dict[str, Obligation]:
-    """As `funnel_obligations`, in l on [low, high]: q / l where u is saturated or the goal is moved, else q / l^2."""
+def goal_obligations(claim: Claim, field: GoalField, low, high, proved: Iterable[str] = ()) -> dict[str, Obligation]:
+    """As `funnel_obligations`, in l on [low, high]: q / l where u is saturated or the goal is moved, else q / l^2.
+
+    `proved` are the names of the cases that a file has.
+    """
     free, forced, gain, late, older = field
     space = free.space
 
@@ -118,7 +122,8 @@ def goal_obligations(claim: Claim, field: GoalField, low, high) -> dict[str, Obl
 
     oldest = None if older is None else asked(older)
     linear, obligations = by_level(gain), {}
-    for name, case in cases_of(space, claim, late, Q(0), asked(gain), low, high, oldest).items():
+    cases = cases_of(space, claim, late, Q(0), asked(gain), low, high, oldest, are_joined(proved))
+    for name, case in cases.items():
         if case.saturated or claim.moves_the_goal:
             held = free + forced * Taylor(space, case.input)
             p, error, drift = held.p * Q(-1), held.r * high + held.d, Q(0)

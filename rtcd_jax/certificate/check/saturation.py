@@ -5,11 +5,12 @@ motor's limit F lies in [F-, F+], and |w| <= `disturbance` comes on top. So
 
     clip(u_lin - error, -F+, F-) - w  <=  u  <=  clip(u_lin + error, -F-, F+) + w,
 
-and what is affine in u and positive at both ends is positive at u.
+and what is affine in u and positive at both ends is positive at u. Where the limit alone is uncertain, both laws are
+free only where |u_lin| <= F+: one case "free" is enough for both.
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any, NamedTuple
 
 from rtcd_jax.certificate.check.claim import Claim
@@ -57,12 +58,13 @@ def cases_of(
     low,
     high,
     oldest: Feedback | None = None,
+    joined: bool = True,
 ) -> dict[str, Case]:
     """By name: "free", "high" and "low", each with "-" and "+" where the laws differ; s in [low, high].
 
     What cannot occur is left out. The conditions are those of all robots together: each holds where it does for one.
     `oldest` is the feedback of the oldest measurement, where these count to first order: the cases "late" are those of
-    its laws.
+    its laws. `joined`: laws that differ in the limit alone have one case "free".
     """
     if oldest is not None:
         now = cases_of(space, claim, error, feedforward, feedback, low, high)
@@ -70,11 +72,13 @@ def cases_of(
         return now | {f"{name}late": case for name, case in then.items()}
     weak, strong = claim.limits
     w, linear, apart = claim.disturbance, feedback.linear, space.size(feedback.offset)
-    laws = {"-": (-error, strong, weak, -w), "+": (error, weak, strong, w)}
-    if error == 0 and weak == strong and w == 0:
-        laws = {"": laws["+"]}
+    free = limited = {"-": (-error, strong, weak, -w), "+": (error, weak, strong, w)}
+    if error == 0 and w == 0:
+        widest = {"": (error, strong, strong, w)}
+        free = widest if joined or weak == strong else free
+        limited = widest if weak == strong else limited
     cases = {}
-    for sign, (shift, lower, upper, on_top) in laws.items():
+    for sign, (shift, lower, upper, on_top) in (free | limited).items():
         middle = feedforward + shift
         clearance = {
             "high": space.poly(upper - middle + apart) - linear,
@@ -85,10 +89,17 @@ def cases_of(
             for case, left in (("high", upper - middle - apart), ("low", lower + middle - apart))
             if not (left > 0 and is_positive(space.poly(left * left) - feedback.squared, {0: (low, high)}, depth=4))
         ]
-        law = space.poly(middle + on_top) + linear + feedback.offset
-        cases[f"free{sign}"] = Case([clearance[case] for case in occurs], law, False)
-        ends = {"high": upper + on_top, "low": on_top - lower}
-        for case in occurs:
-            reached = space.poly(2 * apart) - clearance[case]
-            cases[case + sign] = Case([reached], space.poly(ends[case]), True)
+        if sign in free:
+            law = space.poly(middle + on_top) + linear + feedback.offset
+            cases[f"free{sign}"] = Case([clearance[case] for case in occurs], law, False)
+        if sign in limited:
+            ends = {"high": upper + on_top, "low": on_top - lower}
+            for case in occurs:
+                reached = space.poly(2 * apart) - clearance[case]
+                cases[case + sign] = Case([reached], space.poly(ends[case]), True)
     return cases
+
+
+def are_joined(cases: Iterable[str]) -> bool:
+    """Whether laws that differ in the limit alone have one case "free" among these; older files have two."""
+    return not any(name.startswith("free-") for name in cases)

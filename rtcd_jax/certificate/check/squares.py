@@ -37,6 +37,21 @@ class GramCertificate(NamedTuple):
     further: tuple[tuple[int, ...], ...] = ()
 
 
+class Halves(NamedTuple):
+    """Of an obligation's two halves in s, the first in time first."""
+
+    first: "Squares"
+    second: "Squares"
+
+
+Squares = GramCertificate | Halves
+
+
+def halves_of(todo: Obligation) -> tuple[Obligation, Obligation]:
+    middle = (todo.low + todo.high) / 2
+    return todo._replace(high=middle), todo._replace(low=middle)
+
+
 @lru_cache(None)
 def monomials(n: int, degree: int) -> tuple[tuple[int, ...], ...]:
     """Exponents of y up to `degree`, by degree; on the sphere the last component needs no square."""
@@ -73,16 +88,49 @@ def basis_change(order: int, degree: int, low, high) -> tuple:
     return tuple(rows)
 
 
-def bernstein(p, degree: int, low, high, place: str) -> list[dict]:
-    """Bernstein coefficients in s, each a polynomial in y on the sphere by exponents."""
-    terms = terms_of(p)
-    order = max((e[0] for e, _ in terms), default=0)
-    require(order <= degree, place, f"order {order} in time needs more than {degree + 1} Bernstein polynomials")
-    rows, parts = basis_change(order, degree, low, high), [{} for _ in range(degree + 1)]
-    for e, c in terms:
-        for f, k in reduced(e[1:]):
-            for part, weight in zip(parts, rows[e[0]], strict=True):
-                part[f] = part.get(f, 0) + c * k * weight
+@lru_cache(1000)
+def economizing_basis_change(order: int, degree: int, low, high) -> tuple:
+    """As `basis_change` where degree < order: row k has the coefficients in the Bernstein polynomials of what s^k is
+    without the Chebyshev polynomials T_{degree+1} ... T_order of [low, high], then those of these.
+    """
+    to_bernstein, rows = basis_change(degree, degree, Q(-1), Q(1)), []
+    middle, half = (low + high) / 2, (high - low) / 2
+    for k in range(order + 1):
+        powers = [math.comb(k, i) * middle ** (k - i) * half**i for i in range(k + 1)]
+        lost = [Q(0)] * (order - degree)
+        for i in range(k, degree, -1):
+            lost[i - degree - 1] = share = powers[i] / 2 ** (i - 1)
+            powers = [a - share * t for a, t in zip(powers, chebyshev(i), strict=False)]
+        columns = zip(*to_bernstein, strict=True)
+        kept = [sum((a * b for a, b in zip(powers, column, strict=False)), Q(0)) for column in columns]
+        rows.append((*kept, *lost))
+    return tuple(rows)
+
+
+def bernstein(p, degree: int, low, high) -> tuple[list[dict], Any]:
+    """Bernstein coefficients in s, each a polynomial in y on the sphere by exponents, and by how much they may differ
+    from p, which they do where its order in s is above their degree.
+    """
+    by_y: dict[tuple[int, ...], dict[int, Any]] = {}
+    for e, c in terms_of(p):
+        by_y.setdefault(e[1:], {})[e[0]] = c
+    order = max((k for powers in by_y.values() for k in powers), default=0)
+    rows = (basis_change if order <= degree else economizing_basis_change)(order, degree, low, high)
+    parts: list[dict] = [{} for _ in rows[0]]
+    for e, powers in by_y.items():
+        values = [sum((c * rows[k][j] for k, c in powers.items()), Q(0)) for j in range(len(parts))]
+        for f, k in reduced(e):
+            for part, value in zip(parts, values, strict=True):
+                part[f] = part.get(f, 0) + value * k
+    error = sum((abs(c) * peak(e) for part in parts[degree + 1 :] for e, c in part.items()), Q(0))
+    return parts[: degree + 1], error
+
+
+def condition(g, n: int, degree: int, low, high) -> list[dict]:
+    """As `bernstein`, of a polynomial in (s, y [n]) that is not below g: it is >= 0 wherever g is."""
+    parts, error = bernstein(g, degree, low, high)
+    for part in parts:
+        part[(0,) * n] = part.get((0,) * n, 0) + error
     return parts
 
 
@@ -115,25 +163,28 @@ def quadratic(matrix: Sequence[Sequence], basis: Sequence[tuple[int, ...]]) -> d
     return total
 
 
-def margin(todo: Obligation, certificate: GramCertificate, place: str):
+def margin(todo: Obligation, squares: Squares, place: str):
     """A lower bound > 0 of q where the obligation asks for it.
 
     Raises:
-        Refused: the certificate does not show that.
+        Refused: the squares do not show that.
     """
+    if isinstance(squares, Halves):
+        halves = zip(halves_of(todo), squares, strict=True)
+        return min(margin(half, each, f"{place}[{i}]") for i, (half, each) in enumerate(halves))
     n = len(next(iter(todo.p.to_dict()), (0, 0))) - 1
-    basis, sides = (*monomials(n, certificate.degree), *certificate.further), monomials(n, certificate.degree - 1)
-    degree = len(certificate.gram) - 1
-    parts = bernstein(todo.p, degree, todo.low, todo.high, place)
-    require(len(certificate.multipliers) == len(todo.where), place, f"needs {len(todo.where)} multipliers")
-    for i, (g, multiplier) in enumerate(zip(todo.where, certificate.multipliers, strict=True)):
+    basis, sides = (*monomials(n, squares.degree), *squares.further), monomials(n, squares.degree - 1)
+    parts, error = bernstein(todo.p, len(squares.gram) - 1, todo.low, todo.high)
+    require(len(squares.multipliers) == len(todo.where), place, f"needs {len(todo.where)} multipliers")
+    for i, (g, multiplier) in enumerate(zip(todo.where, squares.multipliers, strict=True)):
         _subtract_product(parts, g, multiplier, sides, todo, f"{place}.multipliers[{i}]")
     bound = None
-    for j, (part, gram) in enumerate(zip(parts, certificate.gram, strict=True)):
+    for j, (part, gram) in enumerate(zip(parts, squares.gram, strict=True)):
         _require_definite(gram, len(basis), f"{place}.gram[{j}]")
         for e, c in quadratic(gram, basis).items():
             part[e] = part.get(e, 0) - c
-        rest = part.pop((0,) * n, Q(0)) - sum((abs(c) * peak(e) for e, c in part.items()), Q(0)) - todo.error
+        lost = sum((abs(c) * peak(e) for e, c in part.items() if any(e)), todo.error + error)
+        rest = part.get((0,) * n, Q(0)) - lost
         require(rest > 0, f"{place}.gram[{j}]", f"proves no decrease: at best {rounded(rest):.3g}, must be > 0")
         bound = rest if bound is None else min(bound, rest)
     return bound
@@ -145,10 +196,10 @@ def _require_definite(matrix, rows: int, place: str) -> None:
 
 
 def _subtract_product(parts, g, multiplier, basis, todo: Obligation, place: str) -> None:
-    """Takes sigma g from the Bernstein coefficients, sigma = sum_a B_a z'S_a z."""
+    """Takes sigma (g + its error) from the Bernstein coefficients, sigma = sum_a B_a z'S_a z."""
     degree, high = len(parts) - 1, len(multiplier) - 1
     require(0 <= high <= degree, place, f"has {high + 1} matrices, must have 1 to {degree + 1}")
-    factors = bernstein(g, degree - high, todo.low, todo.high, place)
+    factors = condition(g, len(basis[0]), degree - high, todo.low, todo.high)
     for a, matrix in enumerate(multiplier):
         _require_definite(matrix, len(basis), f"{place}[{a}]")
         square = quadratic(matrix, basis)

@@ -31,7 +31,7 @@ from rtcd_jax.certificate.check.keep_out import Ellipsoid, HalfSpace, half_space
 from rtcd_jax.certificate.check.matrix import cofactors, dot
 from rtcd_jax.certificate.check.push import require_push
 from rtcd_jax.certificate.check.robot import Robot
-from rtcd_jax.certificate.check.squares import GramCertificate, Obligation, margin
+from rtcd_jax.certificate.check.squares import Obligation, Squares, margin
 from rtcd_jax.certificate.check.taylor import terms_of
 
 FORMAT, VERSION = "rtcd certificate", 2
@@ -57,8 +57,8 @@ class Report(NamedTuple):
     notes: dict[str, str]
 
 
-def margins(todo: Mapping[str, Obligation], cases: Mapping[str, GramCertificate], place: str) -> dict[str, Any]:
-    """Margin by case; refused unless there is a Gram certificate for exactly the cases that can occur."""
+def margins(todo: Mapping[str, Obligation], cases: Mapping[str, Squares], place: str) -> dict[str, Any]:
+    """Margin by case; refused unless there are squares for exactly the cases that can occur."""
     require(todo.keys() == cases.keys(), place, f"must have the cases {', '.join(todo)}, has {', '.join(cases)}")
     return {case: margin(todo[case], cases[case], f"{place}.{case}") for case in todo}
 
@@ -105,7 +105,7 @@ def check_goal(claim: Claim, node: Node, outlet: list) -> tuple[Goal, list, Any]
     require_arrival(claim, outlet, goal.axes, goal.weight, f"{node.place}.axes")
     least, drift = None, Q(0)
     for i, shell in enumerate(goal.shells):
-        todo = goal_obligations(claim, field, shell.start, shell.end)
+        todo = goal_obligations(claim, field, shell.start, shell.end, shell.cases)
         smallest = min(margins(todo, shell.cases, f"{node.place}.shells[{i}].cases").values())
         least = smallest if least is None else min(least, smallest)
         drift = max(drift, *(each.drift for each in todo.values()))

@@ -56,7 +56,7 @@ using Matrix = vector<Row>;
 constexpr int BITS = 128;             // of the fixed point in which enclosures count; every rounding is added to a bound
 constexpr long MAX_BYTES = 1L << 28;  // of a file
 constexpr int MAX_ORDER = 16, MAX_TERMS = 10000, MAX_NOTES = 20, LONGEST_NAME = 40, LONGEST_NOTE = 79;
-constexpr int MOST_JOINTS = 4, MOST_TERMS_OF_ROBOT = 200, HIGHEST = 8, MOST_UNCERTAIN = 6, MOST_GRAMS = 32;
+constexpr int MOST_JOINTS = 4, MOST_TERMS_OF_ROBOT = 200, HIGHEST = 8, MOST_UNCERTAIN = 6, MOST_GRAMS = 32, MOST_HALVINGS = 4;
 constexpr size_t MOST_FURTHER = 32, MOST_SHIFTS = 20;
 constexpr int HIGHEST_SHIFT = 3;
 constexpr int MAX_DEPTH = 100;                   // of lists and objects; a certificate has a dozen
@@ -1403,10 +1403,11 @@ bool is_positive_definite(const Matrix& m) {
 using InY = std::unordered_map<Key, Q, KeyHash>;  // exponents of y, the first in the lowest byte -> coefficient
 
 struct Gram {
-  int degree;
+  int degree = 0;
   vector<Matrix> gram;
   vector<vector<Matrix>> multipliers;
   vector<Key> further;  // monomials of the squares beside those up to the degree
+  vector<Gram> halves;  // two, one of each half in s, in the place of all that
 };
 
 // To show: q > 0 where |y| = 1, s in [low, high] and all `where` >= 0; q is within `error` of p, a polynomial by s and y.
@@ -1451,21 +1452,34 @@ const vector<std::pair<Key, Z>>& on_sphere(Key e, int n) {
   return known.emplace(e, list).first->second;
 }
 
-// Coefficients in the Bernstein polynomials of s, each a polynomial in y on the sphere.
-vector<InY> in_bernstein(const vector<std::pair<Key, Q>>& p, int n, int degree, const Q& low, const Q& high, const string& place) {
-  int order = 0;
-  for (auto& [key, c] : p) order = std::max(order, exponent(key, 0));
-  require(order <= degree, place, "order " + std::to_string(order) + " in time needs more than " +
-                                      std::to_string(degree + 1) + " Bernstein polynomials");
-  vector<InY> by_power(size_t(order) + 1), parts(size_t(degree) + 1);
+// Coefficients in the Bernstein polynomials of s, each a polynomial in y on the sphere, and by how much p may differ from
+// them: what is beyond their degree is cut from its Chebyshev series.
+std::pair<vector<InY>, Q> in_bernstein(const vector<std::pair<Key, Q>>& p, int n, int degree, const Q& low, const Q& high) {
+  size_t order = 0;
+  for (auto& [key, c] : p) order = std::max(order, size_t(exponent(key, 0)));
+  bool cut = order > size_t(degree);
+  Matrix rows = bernstein_of_powers(cut ? degree : int(order), degree, cut ? Q(-1) : low, cut ? Q(1) : high);
+  std::unordered_map<Key, Curve, KeyHash> by_y;
   for (auto& [key, c] : p)
-    for (auto& [f, k] : on_sphere(key >> 8, n)) by_power[size_t(exponent(key, 0))][f] += c * k;
-  Matrix rows = bernstein_of_powers(order, degree, low, high);
-  for (size_t k = 0; k < by_power.size(); k++)
-    for (auto& [f, c] : by_power[k])
+    for (auto& [f, k] : on_sphere(key >> 8, n)) {
+      Curve& powers = by_y[f];
+      powers.resize(order + 1);
+      powers[size_t(exponent(key, 0))] += c * k;
+    }
+  vector<InY> parts(size_t(degree) + 1);
+  Q error = 0;
+  Curve argument{(low + high) / 2, (high - low) / 2};  // s of a time that goes from -1 to 1
+  for (auto& [f, powers] : by_y) {
+    if (cut) {
+      auto [kept, lost] = chebyshev_cut(at(powers, argument), 1, degree);
+      powers = kept;
+      error += lost * exactly(peak(f));
+    }
+    for (size_t k = 0; k < powers.size(); k++)
       for (size_t j = 0; j < parts.size(); j++)
-        if (rows[k][j] != 0) parts[j][f] += c * rows[k][j];
-  return parts;
+        if (powers[k] != 0 && rows[k][j] != 0) parts[j][f] += powers[k] * rows[k][j];
+  }
+  return {parts, error};
 }
 
 // z' S z on the sphere.
@@ -1484,17 +1498,24 @@ void require_definite(const Matrix& m, size_t rows, const string& place) {
 
 // A lower bound > 0 of q where the obligation asks for it.
 Q margin(const Obligation& todo, const Gram& proof, int n, const string& place) {
+  if (!proof.halves.empty()) {
+    Obligation first = todo, second = todo;
+    first.high = second.low = (todo.low + todo.high) / 2;
+    Q least = margin(first, proof.halves[0], n, place + "[0]");
+    return std::min(least, margin(second, proof.halves[1], n, place + "[1]"));
+  }
   auto z = monomials(n, proof.degree), lower = monomials(n, proof.degree - 1);
   z.insert(z.end(), proof.further.begin(), proof.further.end());
   int degree = int(proof.gram.size()) - 1;
-  auto parts = in_bernstein(todo.p, n, degree, todo.low, todo.high, place);
+  auto [parts, error] = in_bernstein(todo.p, n, degree, todo.low, todo.high);
   require(proof.multipliers.size() == todo.where.size(), place, "needs " + std::to_string(todo.where.size()) + " multipliers");
   for (size_t i = 0; i < todo.where.size(); i++) {
     string here = place + ".multipliers[" + std::to_string(i) + "]";
     auto& sigma = proof.multipliers[i];
     int high = int(sigma.size()) - 1;
     require(high >= 0 && high <= degree, here, "has " + std::to_string(high + 1) + " matrices, must have 1 to " + std::to_string(degree + 1));
-    auto g = in_bernstein(todo.where[i], n, degree - high, todo.low, todo.high, here);
+    auto [g, above] = in_bernstein(todo.where[i], n, degree - high, todo.low, todo.high);
+    for (auto& part : g) part[0] += above;  // the condition holds wherever it did
     for (size_t a = 0; a < sigma.size(); a++) {
       require_definite(sigma[a], lower.size(), here + "[" + std::to_string(a) + "]");
       auto square = quadratic(sigma[a], lower, n);
@@ -1516,7 +1537,7 @@ Q margin(const Obligation& todo, const Gram& proof, int n, const string& place) 
     string here = place + ".gram[" + std::to_string(j) + "]";
     require_definite(proof.gram[j], z.size(), here);
     for (auto& [f, c] : quadratic(proof.gram[j], z, n)) parts[j][f] -= c;
-    Q rest = -todo.error;
+    Q rest = -todo.error - error;
     for (auto& [f, c] : parts[j]) rest += f == 0 ? c : Q(-abs(c) * exactly(peak(f)));
     require(rest > 0, here, "proves no decrease: at best " + formatted("%.3g", rounded(rest)) + ", must be > 0");
     if (!least || rest < *least) least = rest;
@@ -1703,37 +1724,49 @@ template <class T>
 using Named = vector<std::pair<string, T>>;  // in the order in which they are decided
 
 // u_lin = feedforward + linear + what is the robot's own and at most `apart`; |linear|^2 <= square on the sphere. A
-// condition holds where it does for one robot. `late` marks the law of the oldest measurement.
+// condition holds where it does for one robot. `late` marks the law of the oldest measurement. Laws that differ in the
+// limit alone are both free where |u_lin| <= F+ at most: if `joined`, in one case.
 void add_cases(Named<Case>& cases, const Claim& claim, const Q& error, const Q& feedforward, const Curve& square,
-               const Q& low, const Q& high, bool late, const Q& apart = 0) {
+               const Q& low, const Q& high, bool late, bool joined, const Q& apart = 0) {
+  struct Law {
+    string name;
+    Q shift, floor, ceiling, on_top;
+    bool free, limited;
+  };
   auto& [weak, strong] = claim.limits;
   const Q& w = claim.disturbance;
-  bool one_law = error == 0 && weak == strong && w == 0;
-  for (int sign : {-1, 1}) {
-    if (one_law && sign < 0) continue;
-    string name = (one_law ? "" : sign < 0 ? "-" : "+") + string(late ? "late" : "");
-    const Q &ceiling = sign < 0 ? weak : strong, &floor = sign < 0 ? strong : weak;
-    Q middle = feedforward + error * sign, on_top = w * sign;
+  bool exact = error == 0 && w == 0, one_law = exact && weak == strong, one_free = one_law || (exact && joined);
+  vector<Law> laws{{"", 0, strong, strong, 0, one_free, one_law},
+                   {"-", -error, strong, weak, -w, !one_free, !one_law},
+                   {"+", error, weak, strong, w, !one_free, !one_law}};
+  for (auto& law : laws) {
+    if (!law.free && !law.limited) continue;
+    string name = law.name + (late ? "late" : "");
+    Q middle = feedforward + law.shift;
     auto occurs = [&](const Q& room) {
       return !(room > 0 && is_positive(Curve{room * room} - square, low, high, DEPTH_OF_CASES));
     };
     Case free;
     Named<Case> at_limits;
-    free.input = {middle + on_top}, free.late = late;
+    free.input = {middle + law.on_top}, free.late = late;
     for (bool above : {true, false}) {
-      Q room = above ? Q(ceiling - middle) : Q(floor + middle);
+      Q room = above ? Q(law.ceiling - middle) : Q(law.floor + middle);
       if (!occurs(room - apart)) continue;
       // free: room -+ linear >= 0; saturated: the opposite
       free.where_constant.push_back({room + apart}), free.where_sign.push_back(above ? -1 : 1);
       Case at_limit;
       at_limit.where_constant = {Curve{apart - room}}, at_limit.where_sign = {above ? 1 : -1};
-      at_limit.input = {above ? Q(ceiling + on_top) : Q(on_top - floor)};
+      at_limit.input = {above ? Q(law.ceiling + law.on_top) : Q(law.on_top - law.floor)};
       at_limit.saturated = true, at_limit.late = late;
       at_limits.push_back({(above ? "high" : "low") + name, at_limit});
     }
-    cases.push_back({"free" + name, free});
-    cases.insert(cases.end(), at_limits.begin(), at_limits.end());
+    if (law.free) cases.push_back({"free" + name, free});
+    if (law.limited) cases.insert(cases.end(), at_limits.begin(), at_limits.end());
   }
+}
+
+bool are_joined(const vector<string>& cases) {
+  return std::none_of(cases.begin(), cases.end(), [](const string& name) { return name.rfind("free-", 0) == 0; });
 }
 
 // Replaces powers above the `degrees` of a robot's numbers by lower ones, T_k being at most 1; returns what that changes.
@@ -2189,8 +2222,9 @@ Named<Obligation> funnel_obligations(const Claim& claim, const Interval& piece, 
   }
 
   Named<Case> cases;
-  add_cases(cases, claim, late, on.input, dot(asked, asked), -1, 1, false, own.largest());
-  if (claim.first_order) add_cases(cases, claim, late, on.input, dot(asked_then, asked_then), -1, 1, true, own_then.largest());
+  bool joined = are_joined(piece.names);
+  add_cases(cases, claim, late, on.input, dot(asked, asked), -1, 1, false, joined, own.largest());
+  if (claim.first_order) add_cases(cases, claim, late, on.input, dot(asked_then, asked_then), -1, 1, true, joined, own_then.largest());
   Named<Obligation> todo;
   vector<int> kept;
   if (!claim.shifts.empty()) kept.assign(piece.orders.begin() + 3, piece.orders.end());
@@ -2287,13 +2321,13 @@ void goal_field(const Claim& claim, const Goal& goal, const string& place, GoalF
 }
 
 // On l in [low, high]: q / l where the input is saturated or the goal is moved, else q / l^2.
-Named<Obligation> goal_obligations(const Claim& claim, const GoalField& field, const Q& low, const Q& high) {
+Named<Obligation> goal_obligations(const Claim& claim, const GoalField& field, const Q& low, const Q& high, bool joined) {
   const Space& wide = field.wide;
   size_t n = claim.n();
   Named<Case> cases;
-  add_cases(cases, claim, field.late, 0, Curve{0, 0, dot(field.asked, field.asked)}, low, high, false);
+  add_cases(cases, claim, field.late, 0, Curve{0, 0, dot(field.asked, field.asked)}, low, high, false, joined);
   if (claim.first_order)
-    add_cases(cases, claim, field.late, 0, Curve{0, 0, dot(field.asked_then, field.asked_then)}, low, high, true);
+    add_cases(cases, claim, field.late, 0, Curve{0, 0, dot(field.asked_then, field.asked_then)}, low, high, true, joined);
   Named<Obligation> todo;
   for (auto& [name, one] : cases) {
     const Row& asked = one.late ? field.asked_then : field.asked;
@@ -2613,36 +2647,42 @@ bool is_case(const string& name) {  // (free|high|low)[-+]?(late)?(/n(,n)*)?
   }
 }
 
+Gram read_squares(const Node& node, int n, int halvings = 0) {
+  Gram proof;
+  if (node.is(Value::LIST)) {
+    node.require(halvings < MOST_HALVINGS, "halves the interval more than " + std::to_string(MOST_HALVINGS) + " times");
+    for (auto& half : node.items(2)) proof.halves.push_back(read_squares(half, n, halvings + 1));
+    return proof;
+  }
+  vector<string> parts{"degree", "gram", "multipliers"};
+  if (node.is(Value::OBJECT) && node.has("further")) parts.push_back("further");
+  node.exactly(parts);
+  proof.degree = int(node.at("degree").integer(1, MAX_ORDER / 2));
+  if (parts.size() == 4) {
+    auto listed = node.at("further").items(-1, 1);
+    node.at("further").require(listed.size() <= MOST_FURTHER, "must have at most " + std::to_string(MOST_FURTHER) + " monomials");
+    for (auto& each : listed) {
+      auto exponents = each.items(n);
+      Key key = 0;
+      for (int i = 0; i < n; i++) key += power(i, int(exponents[size_t(i)].integer(0, MAX_ORDER / 2)));
+      proof.further.push_back(key);
+    }
+  }
+  size_t rows = monomials(n, proof.degree).size() + proof.further.size(), sides = monomials(n, proof.degree - 1).size();
+  auto grams = node.at("gram").items(-1, 1);
+  grams[0].require(grams.size() <= MOST_GRAMS, "must have at most " + std::to_string(MOST_GRAMS) + " matrices");
+  for (auto& each : grams) proof.gram.push_back(each.symmetric(rows));
+  for (auto& each : node.at("multipliers").items()) {
+    proof.multipliers.emplace_back();
+    for (auto& matrix : each.items(-1, 1)) proof.multipliers.back().push_back(matrix.symmetric(sides));
+  }
+  return proof;
+}
+
 void read_cases(const Node& node, int n, vector<string>& names, std::map<string, Gram>& cases) {
   node.require(node.is(Value::OBJECT) && std::all_of(node.value->keys.begin(), node.value->keys.end(), is_case), "must be cases");
   names = node.value->keys;
-  for (auto& name : names) {
-    Node one = node.at(name);
-    vector<string> parts{"degree", "gram", "multipliers"};
-    if (one.is(Value::OBJECT) && one.has("further")) parts.push_back("further");
-    one.exactly(parts);
-    Gram proof;
-    proof.degree = int(one.at("degree").integer(1, MAX_ORDER / 2));
-    if (parts.size() == 4) {
-      auto listed = one.at("further").items(-1, 1);
-      one.at("further").require(listed.size() <= MOST_FURTHER, "must have at most " + std::to_string(MOST_FURTHER) + " monomials");
-      for (auto& each : listed) {
-        auto exponents = each.items(n);
-        Key key = 0;
-        for (int i = 0; i < n; i++) key += power(i, int(exponents[size_t(i)].integer(0, MAX_ORDER / 2)));
-        proof.further.push_back(key);
-      }
-    }
-    size_t rows = monomials(n, proof.degree).size() + proof.further.size(), sides = monomials(n, proof.degree - 1).size();
-    auto grams = one.at("gram").items(-1, 1);
-    grams[0].require(grams.size() <= MOST_GRAMS, "must have at most " + std::to_string(MOST_GRAMS) + " matrices");
-    for (auto& each : grams) proof.gram.push_back(each.symmetric(rows));
-    for (auto& each : one.at("multipliers").items()) {
-      proof.multipliers.emplace_back();
-      for (auto& matrix : each.items(-1, 1)) proof.multipliers.back().push_back(matrix.symmetric(sides));
-    }
-    cases.emplace(name, std::move(proof));
-  }
+  for (auto& name : names) cases.emplace(name, read_squares(node.at(name), n));
 }
 
 // Each of m numbers of a robot counts as `stride` powers of y.
@@ -2821,7 +2861,7 @@ Report check(const Value& content) {
   Q drift = 0;
   for (size_t i = 0; i < goal.shells.size(); i++) {
     const Shell& shell = goal.shells[i];
-    auto todo = goal_obligations(claim, field, shell.start, shell.end);
+    auto todo = goal_obligations(claim, field, shell.start, shell.end, are_joined(shell.names));
     Q found = margins(todo, shell.cases, shell.names, n, at_goal + ".shells[" + std::to_string(i) + "].cases");
     least = least ? std::min(*least, found) : found;
     for (auto& [name, one] : todo) drift = std::max(drift, one.drift);

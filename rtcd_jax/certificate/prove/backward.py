@@ -10,18 +10,17 @@ import itertools
 import math
 from collections.abc import Iterator, Mapping
 from concurrent.futures import Executor
-from functools import cache
 from threading import Event
 from typing import Any, NamedTuple, cast, final
 
 import numpy as np
 
 from rtcd_jax.certificate import check
-from rtcd_jax.certificate.check import Claim, GramCertificate, Interval, Obligation, Refused
+from rtcd_jax.certificate.check import Claim, GramCertificate, Halves, Interval, Obligation, Refused, Squares
 from rtcd_jax.certificate.prove import sdp as program
 from rtcd_jax.certificate.prove.closed_loop import Loop, on_grid
 from rtcd_jax.certificate.prove.levels import followed, unit_directions
-from rtcd_jax.certificate.prove.sdp import Shape
+from rtcd_jax.certificate.prove.sdp import Shape, Solution
 from rtcd_jax.system.errors import UserError
 
 DECAY_MARGINS = {
@@ -33,8 +32,8 @@ LARGEST = {2: 0.1, 4: 0.06}
 """Decay margin [1/s] beyond which an interval is halved rather; of a part, over its length. The shortest have all."""
 RECLAIMED = 0.8
 """Share of the certificates' margin by which the decay margin is lowered."""
-WASTED = 1 / 4
-"""Share of the decay margin beyond which the certificates' margin is worth a second attempt."""
+WASTED = {2: 1 / 4, 4: 1 / 2}
+"""By the number of states: share of the decay margin beyond which the margin is worth a second attempt."""
 LOW = 0.35
 """Share of that up to which a decay margin is low: the next interval is twice as long."""
 SHORTEST = 1 / 16
@@ -48,8 +47,9 @@ MULTIPLIER = 1
 class Tier(NamedTuple):
     """Orders in s and y of Taylor models, the degree of the squares' monomials, and whether they have further ones.
 
-    u_lin has order 4 in s (K times L), so that all fit into Bernstein polynomials of the order in s. About own motions
-    a power of a robot's number counts as `stride` powers of y.
+    The squares' Bernstein polynomials have the models' order in s, or the degree `bernstein`, and are of the whole
+    interval, or of its halves, as often as `halvings`. About own motions a power of a robot's number counts as `stride`
+    powers of y.
     """
 
     time_order: int
@@ -57,6 +57,8 @@ class Tier(NamedTuple):
     degree: int
     further: bool = False
     stride: int = 1
+    bernstein: int | None = None
+    halvings: int = 0
 
     def orders(self, claim: Claim, degrees: tuple[int, ...]) -> tuple[int, ...]:
         """An interval's; `degrees` are those in the robot's numbers."""
@@ -64,12 +66,13 @@ class Tier(NamedTuple):
 
     def shapes(self, todo: dict[str, Obligation], loop: Loop, fewest: int) -> dict[str, list[Shape]]:
         """Of the programs of each case, the cheapest first: of every degree from `fewest` on, then the tier's own."""
+        bernstein = self.time_order if self.bernstein is None else self.bernstein
         further = program.of_the_angles(loop.n, len(loop.hinges), self.degree) if self.further else ()
         lower = [(degree, ()) for degree in range(fewest, self.degree + self.further)]
         sizes: list[tuple[int, program.Monomials]] = [*lower, (self.degree, further)]
         return {
             case: [
-                program.shape_of(each, degree, self.time_order, MULTIPLIER if each.where else 0, monomials)
+                program.shape_of(each, degree, bernstein, MULTIPLIER if each.where else 0, monomials)
                 for degree, monomials in sizes
             ]
             for case, each in todo.items()
@@ -78,12 +81,20 @@ class Tier(NamedTuple):
 
 TIERS = {
     2: (Tier(5, 5, 3), Tier(5, 7, 4), Tier(5, 9, 5), Tier(5, 11, 6)),
-    4: (Tier(5, 3, 2), Tier(5, 5, 3), Tier(7, 8, 3, True)),
+    4: (
+        Tier(5, 3, 2, bernstein=3, halvings=3),
+        Tier(5, 5, 3, bernstein=3, halvings=3),
+        Tier(7, 8, 3, True, bernstein=3, halvings=3),
+    ),
 }
 """By the number of states, the cheapest first."""
 TIERS_OF_OWN_MOTIONS = {
     2: (Tier(5, 5, 3), Tier(5, 7, 4), Tier(5, 9, 5, stride=2), Tier(5, 11, 6, stride=2)),
-    4: (Tier(5, 5, 3), Tier(5, 6, 3, True), Tier(7, 8, 3, True, 2)),
+    4: (
+        Tier(5, 5, 3, bernstein=3, halvings=3),
+        Tier(5, 6, 3, True, bernstein=3, halvings=3),
+        Tier(7, 8, 3, True, 2, bernstein=3, halvings=3),
+    ),
 }
 """As `TIERS`."""
 HIGHEST_DEGREE = 3
@@ -92,6 +103,10 @@ ENOUGH_OF_DEGREES = 1.25
 """Times the error of the models: higher degrees do not help then."""
 FROM_THE_CHEAPEST = 8
 """Knots after which programs begin with the cheapest again, instead of with those that were enough before."""
+ENOUGH = {2: 1.0, 4: 0.25}
+"""By the number of states: share of the decay margin beyond which a case's margin needs no larger program."""
+GAIN = 0.1
+"""Times what is enough: where halves can raise a margin by less, it is not halved."""
 ERROR_FRACTION = 1 / 3
 """A Taylor model is good enough if its error is at most this fraction of the decay margin."""
 
@@ -193,12 +208,12 @@ class BackwardProof:
         k, start, length = proved.interval.knot, float(proved.interval.start), proved.length
         longer = min(1.0, 2 * length) if proved.decay_margin <= LOW * LARGEST[self.claim.n] else length
         first_margin = min(self._lowered(proved.decay_margin, proved.margin), LARGEST[self.claim.n] / longer)
-        sizes = {case: size_of(each) for case, each in proved.interval.cases.items()}
+        sizes = {case: max(map(size_of, pieces(each))) for case, each in proved.interval.cases.items()}
         return ProofState(k, start, proved.rho, proved.interval.first, first_margin, longer, sizes)
 
     def _lowered(self, decay_margin: float, margin: float) -> float:
         """A decay margin that the certificates' margin still allows, if that is much; the same if not."""
-        wasted = margin > max(WASTED * decay_margin, self._rates[0])
+        wasted = margin > max(WASTED[self.claim.n] * decay_margin, self._rates[0])
         return max(self._rates[0], decay_margin - RECLAIMED * margin) if wasted else decay_margin
 
     def _least_margin(self, k: int, start: float, end: float, state: ProofState) -> Proved | None:
@@ -221,10 +236,12 @@ class BackwardProof:
             check.require_kept_out(self.claim, interval, data, "sets")
             if self.claim.first_order:
                 check.require_jump(self.claim, interval, "jumps")
-            interval, todo, shapes = self._models(interval, decay_margin)
+            interval, todo, tier = self._models(interval, decay_margin)
+            shapes = tier.shapes(todo, self.loop, FEWEST)
             if self.claim.shifts and k % FROM_THE_CHEAPEST:  # of their many programs
                 shapes = {case: _from(each, state.sizes.get(case, (0, 0))) for case, each in shapes.items()}
-            proof = prove(todo, shapes, decay_margin, self.exact, self._directions, self.solver, self.pool)
+            enough, effort = ENOUGH[self.claim.n] * decay_margin, Effort(self._directions, self.solver, tier.halvings)
+            proof = prove(todo, shapes, enough, self.exact, effort, self.pool)
         except Refused:
             return None
         if proof is None:
@@ -247,12 +264,8 @@ class BackwardProof:
         orders = self._tiers[0].orders(self.claim, self._degrees[0])
         return Interval(k, *fractions, on_grid(a), state.axes, bend, orders, {}, late, sides), rho
 
-    def _models(
-        self, interval: Interval, decay_margin: float
-    ) -> tuple[Interval, dict[str, Obligation], dict[str, list[Shape]]]:
-        """The interval's obligations by the cheapest Taylor models that are good enough, or the richest, and the shapes
-        of their programs.
-        """
+    def _models(self, interval: Interval, decay_margin: float) -> tuple[Interval, dict[str, Obligation], Tier]:
+        """The interval's obligations by the cheapest Taylor models that are good enough, or the richest."""
         allowed = ERROR_FRACTION * decay_margin
         for tier in self._tiers:
             interval = interval._replace(orders=tier.orders(self.claim, self._degrees[0]))
@@ -265,7 +278,16 @@ class BackwardProof:
             todo = check.obligations_of(self.claim, models, degrees)
             if max(float(each.error) for each in todo.values()) <= max(allowed, ENOUGH_OF_DEGREES * own):
                 break
-        return interval, todo, tier.shapes(todo, self.loop, FEWEST)
+        return interval, todo, tier
+
+
+def pieces(squares: Squares) -> Iterator[GramCertificate]:
+    """First to last."""
+    if isinstance(squares, Halves):
+        for half in squares:
+            yield from pieces(half)
+    else:
+        yield squares
 
 
 def size_of(squares: GramCertificate | Shape) -> tuple[int, int]:
@@ -278,57 +300,95 @@ def _from(shapes: list[Shape], size: tuple[int, int]) -> list[Shape]:
     return [shape for shape in shapes if size_of(shape) >= size] or shapes[-1:]
 
 
+class Effort(NamedTuple):
+    """What goes into squares: the directions [n D] that are tried before a program is solved, cvxpy's solver, and how
+    often an interval may be halved.
+    """
+
+    directions: np.ndarray
+    solver: str
+    halvings: int = 0
+
+
 def prove(
     todo: dict[str, Obligation],
     shapes: dict[str, list[Shape]],
     enough: float,
     exact: bool,
-    directions: np.ndarray,
-    solver: str,
+    effort: Effort,
     pool: Executor | None = None,
-) -> tuple[dict[str, GramCertificate], float] | None:
-    """Gram certificates by case and the least margin; None where a case has none. `exact`: the checker's margin.
+) -> tuple[dict[str, Squares], float] | None:
+    """Squares by case and the least margin; None where a case has none. `exact`: the checker's margin.
 
-    A case is shown by the first of its shapes with a margin of `enough`, or else by the last. The `directions` [n D]
-    are tried before a program is solved. The threads of a `pool` share the cases out, the hardest first.
+    The threads of a `pool` share the cases out, the hardest first.
 
     Raises:
-        Refused: the checker does not accept a certificate of the solver's.
+        Refused: the checker does not accept squares of the solver's.
     """
-
-    @cache
-    def sampled(case: str, shape: Shape) -> tuple[program.Data, float]:
-        data = program.data_of(todo[case], shape)
-        return data, program.lowest(data, shape, directions)
-
-    hardest = {case: sampled(case, shapes[case][-1])[1] for case in todo}
+    hardest = {case: _sampled(each, shapes[case][-1], effort.directions) for case, each in todo.items()}
     if min(hardest.values()) <= 0:
         return None
     ended = Event()
 
-    def shown(case: str) -> tuple[GramCertificate, float] | None:
-        solution = None
-        for shape in shapes[case]:
-            needed = 0 if shape is shapes[case][-1] else enough
-            data, lowest = sampled(case, shape)
-            if lowest > needed and not ended.is_set():
-                solution = program.solve(data, shape, solver)
-                if solution is not None and solution.margin > needed:
-                    break
-        if solution is None:
+    def shown(case: str) -> tuple[Squares, float] | None:
+        found = _squares(todo[case], shapes[case], enough, effort, ended)
+        if found.squares is None:
             ended.set()
             return None
-        certificate = solution.certificate
-        return certificate, float(cast(Any, check.margin(todo[case], certificate, case))) if exact else solution.margin
+        squares = found.squares
+        return squares, float(cast(Any, check.margin(todo[case], squares, case))) if exact else found.margin
 
-    certificates, least = {}, np.inf
+    cases, least = {}, np.inf
     order = sorted(todo, key=hardest.__getitem__)
     try:
         for case, found in zip(order, (pool.map if pool else map)(shown, order), strict=True):
             if found is None:
                 return None
-            certificates[case] = found[0]
+            cases[case] = found[0]
             least = min(least, found[1])
     finally:
         ended.set()
-    return {case: certificates[case] for case in todo}, least
+    return {case: cases[case] for case in todo}, least
+
+
+def _sampled(todo: Obligation, shape: Shape, directions: np.ndarray) -> float:
+    """The least of what must be positive over the directions; no margin is larger, be the interval whole or not."""
+    shape = shape._replace(bernstein=max(shape.bernstein, *(e[0] for e, _ in check.terms_of(todo.p))))
+    return program.lowest(program.data_of(todo, shape), shape, directions)
+
+
+def _squares(
+    todo: Obligation, shapes: list[Shape], enough: float, effort: Effort, ended: Event, whole: float = -math.inf
+) -> Solution:
+    """By the first of the shapes with a margin of `enough`; where none has, by halves if these can have much more, and
+    only then by further monomials, if nothing else has a margin. `whole` is the margin of what this is a half of.
+    """
+    usual = [shape for shape in shapes if not shape.further] if effort.halvings else shapes
+    best = _by_shapes(todo, usual, enough, effort, ended)
+    if best.margin >= enough:
+        return best
+    if effort.halvings and not best.margin - whole < GAIN * enough:
+        effort, least, halves = effort._replace(halvings=effort.halvings - 1), math.inf, []
+        for half in check.halves_of(todo):
+            found = _squares(half, shapes, enough, effort, ended, best.margin)
+            if found.squares is None:
+                return best
+            least = min(least, found.margin)
+            halves.append(found.squares)
+        return Solution(least, Halves(*halves))
+    if best.margin > 0:
+        return best
+    return _by_shapes(todo, [shape for shape in shapes if shape not in usual], enough, effort, ended)
+
+
+def _by_shapes(todo: Obligation, shapes: list[Shape], enough: float, effort: Effort, ended: Event) -> Solution:
+    """By the first of the shapes with a margin of `enough`, or else by the last."""
+    best = Solution(-math.inf)
+    for shape in shapes:
+        needed = 0 if shape is shapes[-1] else enough
+        data = program.data_of(todo, shape)
+        if program.lowest(data, shape, effort.directions) > needed and not ended.is_set():
+            best = program.solve(data, shape, effort.solver)
+            if best.margin > needed:
+                break
+    return best

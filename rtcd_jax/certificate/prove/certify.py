@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from rtcd_jax.certificate import check
-from rtcd_jax.certificate.check import Claim, GramCertificate, Node, Refused
+from rtcd_jax.certificate.check import Claim, Halves, Node, Refused, Squares
 from rtcd_jax.certificate.enlarge import all_knots as joint
 from rtcd_jax.certificate.enlarge import knot_by_knot as backward
 from rtcd_jax.certificate.prove.backward import BackwardProof, ProofState, Proved
@@ -322,15 +322,18 @@ def _sides_record(sides: list) -> dict[str, Any]:
     return {"sides": [_matrix(each) for each in sides]} if sides else {}
 
 
-def _cases_record(cases: Mapping[str, GramCertificate]) -> dict[str, Any]:
+def _cases_record(cases: Mapping[str, Squares]) -> dict[str, Any]:
+    return {case: _squares_record(squares) for case, squares in cases.items()}
+
+
+def _squares_record(squares: Squares) -> Any:
+    if isinstance(squares, Halves):
+        return [_squares_record(half) for half in squares]
     return {
-        case: {
-            "degree": certificate.degree,
-            "gram": [_triangle(matrix) for matrix in certificate.gram],
-            "multipliers": [[_triangle(matrix) for matrix in each] for each in certificate.multipliers],
-            **({"further": [list(each) for each in certificate.further]} if certificate.further else {}),
-        }
-        for case, certificate in cases.items()
+        "degree": squares.degree,
+        "gram": [_triangle(matrix) for matrix in squares.gram],
+        "multipliers": [[_triangle(matrix) for matrix in each] for each in squares.multipliers],
+        **({"further": [list(each) for each in squares.further]} if squares.further else {}),
     }
 
 

@@ -7,7 +7,7 @@ import numpy as np
 
 from rtcd_jax.certificate import check
 from rtcd_jax.certificate.check import Claim, Refused, Shell
-from rtcd_jax.certificate.prove.backward import Tier, prove
+from rtcd_jax.certificate.prove.backward import Effort, Tier, prove
 from rtcd_jax.certificate.prove.closed_loop import Loop, on_grid
 from rtcd_jax.certificate.prove.field import floats
 from rtcd_jax.certificate.prove.levels import goal_level, unit_directions
@@ -92,7 +92,7 @@ def _at_level(
                 todo = check.goal_obligations(claim, field, *ends)
                 error = max(float(each.error) for each in todo.values())
                 shapes = tier.shapes(todo, loop, tier.degree)
-                proof = prove(todo, shapes, ENOUGH, exact, directions, solver, pool)
+                proof = prove(todo, shapes, ENOUGH, exact, Effort(directions, solver), pool)
             if proof is not None:
                 shells.append(Shell(*ends, proof[0]))
                 least = min(least, proof[1])

@@ -25,7 +25,7 @@ import numpy as np
 import scipy.sparse as sp
 
 from rtcd_jax.certificate import check
-from rtcd_jax.certificate.check import GramCertificate, Obligation, Q
+from rtcd_jax.certificate.check import GramCertificate, Obligation, Q, Squares
 from rtcd_jax.system.errors import UserError
 
 if TYPE_CHECKING:
@@ -79,10 +79,10 @@ class Data(NamedTuple):
 @final
 @dataclass(frozen=True)
 class Solution:
-    """Margin t and the matrices G_j, S_ia behind it; not proved before the checker accepts them."""
+    """Margin t and, if it is positive, the squares behind it; not proved before the checker accepts them."""
 
     margin: float
-    certificate: GramCertificate
+    squares: Squares | None = None
 
 
 @lru_cache(None)
@@ -130,22 +130,20 @@ def shape_of(todo: Obligation, degree: int, bernstein: int, multiplier: int, fur
 
 
 def data_of(todo: Obligation, shape: Shape) -> Data:
-    """The obligation in floats.
-
-    Raises:
-        Refused: its orders in s exceed the Bernstein degrees.
-    """
-    p, lost = _floats(todo.p, todo, shape.bernstein, _products(shape.basis, 2 * shape.degree))
-    p[:, 0] -= float(todo.error) + lost
+    """The obligation in floats."""
+    span = todo.low, todo.high
+    parts, cut = check.bernstein(todo.p, shape.bernstein, *span)
+    p, lost = _floats(parts, _products(shape.basis, 2 * shape.degree))
+    p[:, 0] -= float(todo.error + cut) + lost
     side, rest = check.monomials(shape.n, 1), shape.bernstein - shape.multiplier
-    g = [_floats(each, todo, rest, side)[0] for each in todo.where]
+    g = [_floats(check.condition(each, shape.n, rest, *span), side)[0] for each in todo.where]
     return Data(p, np.array(g).reshape(len(g), rest + 1, len(side)))
 
 
-def _floats(p, todo: Obligation, degree: int, monomials: Monomials) -> tuple[np.ndarray, np.ndarray]:
-    """Its coefficients [j, monomial], and bounds [j] of what other monomials have."""
-    parts, index = check.bernstein(p, degree, todo.low, todo.high, "program"), _index(monomials)
-    table, others = np.zeros((degree + 1, len(index))), np.zeros(degree + 1)
+def _floats(parts: list[dict], monomials: Monomials) -> tuple[np.ndarray, np.ndarray]:
+    """Coefficients [j, monomial] of polynomials, and bounds [j] of what other monomials have."""
+    index = _index(monomials)
+    table, others = np.zeros((len(parts), len(index))), np.zeros(len(parts))
     for j, part in enumerate(parts):
         for e, c in part.items():
             if e in index:
@@ -251,11 +249,11 @@ def program_of(shape: Shape) -> Iterator[Program]:
         free.append(program)
 
 
-def solve(data: Data, shape: Shape, solver: str = SOLVER) -> Solution | None:
-    """The best Gram certificate by a solver of cvxpy's; None where it has none, or no positive margin."""
+def solve(data: Data, shape: Shape, solver: str = SOLVER) -> Solution:
+    """The best Gram certificate by a solver of cvxpy's."""
     with program_of(shape) as program:
         margin = program.margin(data, solver)
-        return Solution(margin, program.certificate()) if margin > 0 else None
+        return Solution(margin, program.certificate() if margin > 0 else None)
 
 
 def require_solver(name: str) -> str:
