@@ -7,6 +7,7 @@ from scipy.integrate import solve_ivp
 from rtcd_jax.certificate import check
 from rtcd_jax.certificate.check import GramCertificate, Halves, Obligation, Q, Refused, polynomial
 from rtcd_jax.certificate.prove import sdp as program
+from rtcd_jax.certificate.prove.backward import Effort, prove
 from rtcd_jax.system.errors import UserError
 
 NOTHING = Q(0)
@@ -254,3 +255,63 @@ def test_samples_bound_the_margin():
     shape, angle = program.shape_of(todo, 2, 3, 1), np.linspace(0, 2 * np.pi, 10000)
     circle = np.stack([np.cos(angle), np.sin(angle)])
     assert program.lowest(program.data_of(todo, shape), shape, circle) == pytest.approx(-0.11, abs=1e-3)
+
+
+# What the prover does with them ---------------------------------------------------------------------------------------
+
+CIRCLE = np.array([[np.cos(a), np.sin(a)] for a in np.linspace(0, 2 * np.pi, 60)]).T
+
+
+@pytest.fixture
+def solved(monkeypatch):
+    """The shapes of all programs that are solved."""
+    shapes, solve = [], program.solve
+    monkeypatch.setattr(
+        program, "solve", lambda data, shape, solver: shapes.append(shape) or solve(data, shape, solver)
+    )
+    return shapes
+
+
+def proved(todo, shapes, enough, halvings, halved=0):
+    effort = Effort(CIRCLE[: program.shape_of(todo, 1, 0, 0).n], program.SOLVER, halvings, {"free": halved})
+    found = prove({"free": todo}, {"free": shapes}, enough, True, effort)
+    return (None, None) if found is None else (found[0]["free"], found[1])
+
+
+def bent(least):
+    """s^2 + least on [-1, 1]."""
+    return Obligation(
+        polynomial(2, {(2, 0, 0): Q(1), (0, 0, 0): exact(least)}), NOTHING, NOTHING, [], exact(-1), exact(1)
+    )
+
+
+def test_intervals_are_halved_where_that_helps(solved):
+    todo = bent(0.01)
+    shapes = [program.shape_of(todo, 1, 2, 0)]
+    assert proved(todo, shapes, 0.005, 0) == (None, None)
+    squares, margin = proved(todo, shapes, 0.005, 3)
+    assert isinstance(squares, Halves)
+    assert not any(isinstance(half, Halves) for half in squares)
+    assert margin == pytest.approx(0.01, abs=1e-5)
+    assert len(solved) == 1 + 3
+    again, _ = proved(todo, shapes, 0.005, 3, halved=1)
+    assert again == squares
+    assert len(solved) == 4 + 2
+
+
+def test_a_positive_margin_is_kept_where_halves_cannot_have_more(solved):
+    todo = bent(1.01)
+    squares, margin = proved(todo, [program.shape_of(todo, 1, 2, 0)], 3, 3)
+    assert margin == pytest.approx(1.01, abs=1e-5)
+    assert len(solved) == 1 + 2 + 4
+    assert all(isinstance(half, Halves) for half in squares)
+
+
+def test_monomials_that_are_needed_anyhow_are_tried_before_halves(solved):
+    """0.4 + y_1^8 / 2, of which squares of cubics show -0.1 at any time."""
+    todo = anywhere(polynomial(2, {(0, 0, 0): exact(0.4), (0, 8, 0): Q(1, 2)}))
+    usual, larger = (program.shape_of(todo, 3, 0, 0, further) for further in ((), ((4, 0),)))
+    squares, margin = proved(todo, [usual, larger], 0.1, 3)
+    assert squares.further == ((4, 0),)
+    assert margin == pytest.approx(0.4, abs=1e-5)
+    assert solved == [larger]

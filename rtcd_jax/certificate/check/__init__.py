@@ -53,7 +53,8 @@ certificate gives p = sum_j B_j(s) p_j(y) in Bernstein polynomials with, modulo 
 g_i >= 0 the inequalities of the case. B_j >= 0 and sum_j B_j = 1, so that q >= min_j inf rest_j - r = margin > 0 on the
 case. There may be such proofs of the two halves in s, or of halves of these, in the place of one. Where p has a higher
 order in s than the B_j, the rest of its Chebyshev series counts to r; where g_i has, to g_i (g_i plus that is >= 0
-wherever g_i is). So |y| decreases wherever |y| = 1: no motion leaves E (x' is bounded, and the intervals join without a gap).
+wherever g_i is). So |y| decreases wherever |y| = 1: no motion leaves E (x' is bounded, and the intervals join without
+a gap).
 *Goal.* The same with y = l z, |z| = 1, l in [rest, 1] in the place of s, and q divided by l. So |y| decreases wherever
 l >= rest. Where no w, noise or age acts, rest = 0, and q is divided by l^2 where u is free: the remainder of q is
 r l^2 + d l, where d bounds what does not vanish with l (x_g is a rounded multiple of pi), and |y| decreases wherever

@@ -28,7 +28,7 @@ DECAY_MARGINS = {
     4: (0.02, 0.05, 0.1, 0.2, 0.5, 1.5, 4.0, 10.0, 25.0),
 }
 """By the number of states: decay margins [1/s] in the order of trial."""
-LARGEST = {2: 0.1, 4: 0.06}
+LARGEST = {2: 0.1, 4: 0.1}
 """Decay margin [1/s] beyond which an interval is halved rather; of a part, over its length. The shortest have all."""
 RECLAIMED = 0.8
 """Share of the certificates' margin by which the decay margin is lowered."""
@@ -85,6 +85,7 @@ TIERS = {
         Tier(5, 3, 2, bernstein=3, halvings=3),
         Tier(5, 5, 3, bernstein=3, halvings=3),
         Tier(7, 8, 3, True, bernstein=3, halvings=3),
+        Tier(7, 9, 3, True, bernstein=3, halvings=3),
     ),
 }
 """By the number of states, the cheapest first."""
@@ -160,8 +161,8 @@ class Proved(NamedTuple):
 class ProofState(NamedTuple):
     """How far the proof has come: a fraction of an interval, the level and the ellipsoid there.
 
-    `first_margin` [1/s] is the decay margin that the next interval begins with, and `length` its fraction; `sizes` of
-    the squares' monomials, by case, were enough for the last one.
+    `first_margin` [1/s] is the decay margin that the next interval begins with, and `length` its fraction; by case,
+    `sizes` of the squares' monomials were enough for the last one, and all of it was `halved` so often at least.
     """
 
     knot: int
@@ -171,6 +172,7 @@ class ProofState(NamedTuple):
     first_margin: float
     length: float
     sizes: Mapping[str, tuple[int, int]]
+    halved: Mapping[str, int]
 
 
 @final
@@ -187,7 +189,7 @@ class BackwardProof:
     def outlet(self, rho: float) -> ProofState:
         """The state at which the proof begins: t_N with the level rho."""
         last = len(self.loop.u) - 1
-        return ProofState(last, 1.0, rho, on_grid(self.loop.axes(last, 1.0, rho, 0.0)[0]), self._rates[0], 1.0, {})
+        return ProofState(last, 1.0, rho, on_grid(self.loop.axes(last, 1.0, rho, 0.0)[0]), self._rates[0], 1.0, {}, {})
 
     def intervals_from(self, state: ProofState) -> Iterator[Proved]:
         """The proved intervals from the state back to t = 0, or to where nothing can be proved."""
@@ -209,7 +211,8 @@ class BackwardProof:
         longer = min(1.0, 2 * length) if proved.decay_margin <= LOW * LARGEST[self.claim.n] else length
         first_margin = min(self._lowered(proved.decay_margin, proved.margin), LARGEST[self.claim.n] / longer)
         sizes = {case: max(map(size_of, pieces(each))) for case, each in proved.interval.cases.items()}
-        return ProofState(k, start, proved.rho, proved.interval.first, first_margin, longer, sizes)
+        halved = {case: least_halvings(each) for case, each in proved.interval.cases.items()}
+        return ProofState(k, start, proved.rho, proved.interval.first, first_margin, longer, sizes, halved)
 
     def _lowered(self, decay_margin: float, margin: float) -> float:
         """A decay margin that the certificates' margin still allows, if that is much; the same if not."""
@@ -238,10 +241,11 @@ class BackwardProof:
                 check.require_jump(self.claim, interval, "jumps")
             interval, todo, tier = self._models(interval, decay_margin)
             shapes = tier.shapes(todo, self.loop, FEWEST)
+            halved = state.halved if k % FROM_THE_CHEAPEST else {}
             if self.claim.shifts and k % FROM_THE_CHEAPEST:  # of their many programs
                 shapes = {case: _from(each, state.sizes.get(case, (0, 0))) for case, each in shapes.items()}
-            enough, effort = ENOUGH[self.claim.n] * decay_margin, Effort(self._directions, self.solver, tier.halvings)
-            proof = prove(todo, shapes, enough, self.exact, effort, self.pool)
+            effort = Effort(self._directions, self.solver, tier.halvings, halved)
+            proof = prove(todo, shapes, ENOUGH[self.claim.n] * decay_margin, self.exact, effort, self.pool)
         except Refused:
             return None
         if proof is None:
@@ -290,6 +294,10 @@ def pieces(squares: Squares) -> Iterator[GramCertificate]:
         yield squares
 
 
+def least_halvings(squares: Squares) -> int:
+    return 1 + min(map(least_halvings, squares)) if isinstance(squares, Halves) else 0
+
+
 def size_of(squares: GramCertificate | Shape) -> tuple[int, int]:
     """Degree of the monomials, and how many there are beyond it."""
     return squares.degree, len(squares.further)
@@ -301,13 +309,14 @@ def _from(shapes: list[Shape], size: tuple[int, int]) -> list[Shape]:
 
 
 class Effort(NamedTuple):
-    """What goes into squares: the directions [n D] that are tried before a program is solved, cvxpy's solver, and how
-    often an interval may be halved.
+    """What goes into squares: the directions [n D] that are tried before a program is solved, cvxpy's solver, how often
+    an interval may be halved, and by case how often it is before anything else.
     """
 
     directions: np.ndarray
     solver: str
     halvings: int = 0
+    halved: Mapping[str, int] = {}
 
 
 def prove(
@@ -331,7 +340,7 @@ def prove(
     ended = Event()
 
     def shown(case: str) -> tuple[Squares, float] | None:
-        found = _squares(todo[case], shapes[case], enough, effort, ended)
+        found = _squares(todo[case], shapes[case], enough, effort, ended, effort.halved.get(case, 0))
         if found.squares is None:
             ended.set()
             return None
@@ -358,27 +367,37 @@ def _sampled(todo: Obligation, shape: Shape, directions: np.ndarray) -> float:
 
 
 def _squares(
-    todo: Obligation, shapes: list[Shape], enough: float, effort: Effort, ended: Event, whole: float = -math.inf
+    todo: Obligation,
+    shapes: list[Shape],
+    enough: float,
+    effort: Effort,
+    ended: Event,
+    halve: int = 0,
+    whole: float = -math.inf,
 ) -> Solution:
     """By the first of the shapes with a margin of `enough`; where none has, by halves if these can have much more, and
-    only then by further monomials, if nothing else has a margin. `whole` is the margin of what this is a half of.
+    only then by further monomials, if nothing else has a margin. `whole` is the margin of what this is a half of; it is
+    to be halved once more, `halve` times, at once.
     """
-    usual = [shape for shape in shapes if not shape.further] if effort.halvings else shapes
-    best = _by_shapes(todo, usual, enough, effort, ended)
+    usual = [shape for shape in shapes if not (shape.further and effort.halvings)] or shapes
+    best = Solution(-math.inf) if halve and effort.halvings else _by_shapes(todo, usual, enough, effort, ended)
+    if best.margin == -math.inf and usual != shapes and _sampled(todo, usual[-1], effort.directions) <= 0:
+        usual = shapes = shapes[-1:]
+        best = _by_shapes(todo, shapes, enough, effort, ended)
     if best.margin >= enough:
         return best
     if effort.halvings and not best.margin - whole < GAIN * enough:
         effort, least, halves = effort._replace(halvings=effort.halvings - 1), math.inf, []
         for half in check.halves_of(todo):
-            found = _squares(half, shapes, enough, effort, ended, best.margin)
+            found = _squares(half, shapes, enough, effort, ended, max(halve - 1, 0), best.margin)
             if found.squares is None:
                 return best
             least = min(least, found.margin)
             halves.append(found.squares)
         return Solution(least, Halves(*halves))
-    if best.margin > 0:
+    if best.margin > 0 or usual == shapes:
         return best
-    return _by_shapes(todo, [shape for shape in shapes if shape not in usual], enough, effort, ended)
+    return _by_shapes(todo, shapes[-1:], enough, effort, ended)
 
 
 def _by_shapes(todo: Obligation, shapes: list[Shape], enough: float, effort: Effort, ended: Event) -> Solution:
