@@ -2,8 +2,9 @@
 
 On an interval the level follows the fastest growth of V, found on sampled directions, plus a decay margin: a rate that
 the level gives away so that V falls strictly. The limits on the states cap the level. The semidefinite program then
-only verifies. Where it fails, the decay margin is raised, then the interval halved, and so on. Where it leaves much
-more than it needs, the interval is proved once more with a lower decay margin.
+only verifies, case by case: where it has to, on halves of the time, halves of these, and so on. Where it fails, the
+decay margin is raised, then the interval halved, and so on. Where it leaves much more than it needs, the interval is
+proved once more with a lower decay margin.
 """
 
 import itertools
@@ -47,9 +48,7 @@ MULTIPLIER = 1
 class Tier(NamedTuple):
     """Orders in s and y of Taylor models, the degree of the squares' monomials, and whether they have further ones.
 
-    The squares' Bernstein polynomials have the models' order in s, or the degree `bernstein`, and are of the whole
-    interval, or of its halves, as often as `halvings`. About own motions a power of a robot's number counts as `stride`
-    powers of y.
+    About own motions a power of a robot's number counts as `stride` powers of y.
     """
 
     time_order: int
@@ -57,16 +56,15 @@ class Tier(NamedTuple):
     degree: int
     further: bool = False
     stride: int = 1
-    bernstein: int | None = None
-    halvings: int = 0
 
     def orders(self, claim: Claim, degrees: tuple[int, ...]) -> tuple[int, ...]:
         """An interval's; `degrees` are those in the robot's numbers."""
         return (self.time_order, self.order, *((self.stride, *degrees) if claim.shifts else ()))
 
-    def shapes(self, todo: dict[str, Obligation], loop: Loop, fewest: int) -> dict[str, list[Shape]]:
-        """Of the programs of each case, the cheapest first: of every degree from `fewest` on, then the tier's own."""
-        bernstein = self.time_order if self.bernstein is None else self.bernstein
+    def shapes(self, todo: dict[str, Obligation], loop: Loop, fewest: int, bernstein: int) -> dict[str, list[Shape]]:
+        """Of the programs of each case, the cheapest first: of every degree from `fewest` on, then the tier's own;
+        `bernstein` is the degree in s.
+        """
         further = program.of_the_angles(loop.n, len(loop.hinges), self.degree) if self.further else ()
         lower = [(degree, ()) for degree in range(fewest, self.degree + self.further)]
         sizes: list[tuple[int, program.Monomials]] = [*lower, (self.degree, further)]
@@ -81,21 +79,12 @@ class Tier(NamedTuple):
 
 TIERS = {
     2: (Tier(5, 5, 3), Tier(5, 7, 4), Tier(5, 9, 5), Tier(5, 11, 6)),
-    4: (
-        Tier(5, 3, 2, bernstein=3, halvings=3),
-        Tier(5, 5, 3, bernstein=3, halvings=3),
-        Tier(7, 8, 3, True, bernstein=3, halvings=3),
-        Tier(7, 9, 3, True, bernstein=3, halvings=3),
-    ),
+    4: (Tier(5, 3, 2), Tier(5, 5, 3), Tier(7, 8, 3, True), Tier(7, 9, 3, True)),
 }
 """By the number of states, the cheapest first."""
 TIERS_OF_OWN_MOTIONS = {
     2: (Tier(5, 5, 3), Tier(5, 7, 4), Tier(5, 9, 5, stride=2), Tier(5, 11, 6, stride=2)),
-    4: (
-        Tier(5, 5, 3, bernstein=3, halvings=3),
-        Tier(5, 6, 3, True, bernstein=3, halvings=3),
-        Tier(7, 8, 3, True, 2, bernstein=3, halvings=3),
-    ),
+    4: (Tier(5, 5, 3), Tier(5, 6, 3, True), Tier(7, 8, 3, True, 2)),
 }
 """As `TIERS`."""
 HIGHEST_DEGREE = 3
@@ -104,6 +93,10 @@ ENOUGH_OF_DEGREES = 1.25
 """Times the error of the models: higher degrees do not help then."""
 FROM_THE_CHEAPEST = 8
 """Knots after which programs begin with the cheapest again, instead of with those that were enough before."""
+BERNSTEIN = {2: 5, 4: 3}
+"""By the number of states: degree of the Bernstein polynomials in s. Models of two states have no higher order."""
+HALVINGS = {2: 0, 4: 3}
+"""By the number of states: how often an interval is halved in the proof of one of its cases."""
 ENOUGH = {2: 1.0, 4: 0.25}
 """By the number of states: share of the decay margin beyond which a case's margin needs no larger program."""
 GAIN = 0.1
@@ -240,12 +233,13 @@ class BackwardProof:
             if self.claim.first_order:
                 check.require_jump(self.claim, interval, "jumps")
             interval, todo, tier = self._models(interval, decay_margin)
-            shapes = tier.shapes(todo, self.loop, FEWEST)
+            n = self.claim.n
+            shapes = tier.shapes(todo, self.loop, FEWEST, BERNSTEIN[n])
             halved = state.halved if k % FROM_THE_CHEAPEST else {}
             if self.claim.shifts and k % FROM_THE_CHEAPEST:  # of their many programs
                 shapes = {case: _from(each, state.sizes.get(case, (0, 0))) for case, each in shapes.items()}
-            effort = Effort(self._directions, self.solver, tier.halvings, halved)
-            proof = prove(todo, shapes, ENOUGH[self.claim.n] * decay_margin, self.exact, effort, self.pool)
+            effort = Effort(self._directions, self.solver, HALVINGS[n], halved)
+            proof = prove(todo, shapes, ENOUGH[n] * decay_margin, self.exact, effort, self.pool)
         except Refused:
             return None
         if proof is None:
@@ -362,7 +356,8 @@ def prove(
 
 def _sampled(todo: Obligation, shape: Shape, directions: np.ndarray) -> float:
     """The least of what must be positive over the directions; no margin is larger, be the interval whole or not."""
-    shape = shape._replace(bernstein=max(shape.bernstein, *(e[0] for e, _ in check.terms_of(todo.p))))
+    order = max(e[0] for e, _ in check.terms_of(todo.p))
+    shape = shape._replace(bernstein=max(shape.bernstein, order))
     return program.lowest(program.data_of(todo, shape), shape, directions)
 
 

@@ -91,7 +91,7 @@ def _at_level(
             if start or not claim.moves_the_goal:
                 todo = check.goal_obligations(claim, field, *ends)
                 error = max(float(each.error) for each in todo.values())
-                shapes = tier.shapes(todo, loop, tier.degree)
+                shapes = tier.shapes(todo, loop, tier.degree, tier.time_order)
                 proof = prove(todo, shapes, ENOUGH, exact, Effort(directions, solver), pool)
             if proof is not None:
                 shells.append(Shell(*ends, proof[0]))
