@@ -301,7 +301,7 @@ def test_intervals_are_halved_where_that_helps(solved):
 
 def test_a_positive_margin_is_kept_where_halves_cannot_have_more(solved):
     todo = bent(1.01)
-    squares, margin = proved(todo, [program.shape_of(todo, 1, 2, 0)], 3, 3)
+    squares, margin = proved(todo, [program.shape_of(todo, 1, 2, 0)], 1.5, 3)
     assert margin == pytest.approx(1.01, abs=1e-5)
     assert len(solved) == 1 + 2 + 4
     assert all(isinstance(half, Halves) for half in squares)

@@ -29,12 +29,12 @@ DECAY_MARGINS = {
     4: (0.02, 0.05, 0.1, 0.2, 0.5, 1.5, 4.0, 10.0, 25.0),
 }
 """By the number of states: decay margins [1/s] in the order of trial."""
-LARGEST = {2: 0.1, 4: 0.1}
+LARGEST = {2: 0.1, 4: 0.06}
 """Decay margin [1/s] beyond which an interval is halved rather; of a part, over its length. The shortest have all."""
 RECLAIMED = 0.8
 """Share of the certificates' margin by which the decay margin is lowered."""
-WASTED = {2: 1 / 4, 4: 1 / 2}
-"""By the number of states: share of the decay margin beyond which the margin is worth a second attempt."""
+WASTED = 1 / 4
+"""Share of the decay margin beyond which the certificates' margin is worth a second attempt."""
 LOW = 0.35
 """Share of that up to which a decay margin is low: the next interval is twice as long."""
 SHORTEST = 1 / 16
@@ -92,15 +92,17 @@ HIGHEST_DEGREE = 3
 ENOUGH_OF_DEGREES = 1.25
 """Times the error of the models: higher degrees do not help then."""
 FROM_THE_CHEAPEST = 8
-"""Knots after which programs begin with the cheapest again, instead of with those that were enough before."""
+"""Knots after which programs begin with the cheapest again, instead of with those that were enough before, and four
+states with an interval twice as long.
+"""
 BERNSTEIN = {2: 5, 4: 3}
 """By the number of states: degree of the Bernstein polynomials in s. Models of two states have no higher order."""
 HALVINGS = {2: 0, 4: 3}
 """By the number of states: how often an interval is halved in the proof of one of its cases."""
 ENOUGH = {2: 1.0, 4: 0.25}
 """By the number of states: share of the decay margin beyond which a case's margin needs no larger program."""
-GAIN = 0.1
-"""Times what is enough: where halves can raise a margin by less, it is not halved."""
+GAIN = 0.5
+"""Times what is enough: where a half has so little more than the whole, it is not halved once more."""
 ERROR_FRACTION = 1 / 3
 """A Taylor model is good enough if its error is at most this fraction of the decay margin."""
 
@@ -201,15 +203,17 @@ class BackwardProof:
     def after(self, proved: Proved) -> ProofState:
         """The state behind a proved interval. Where a low decay margin was enough, the next one is longer."""
         k, start, length = proved.interval.knot, float(proved.interval.start), proved.length
-        longer = min(1.0, 2 * length) if proved.decay_margin <= LOW * LARGEST[self.claim.n] else length
-        first_margin = min(self._lowered(proved.decay_margin, proved.margin), LARGEST[self.claim.n] / longer)
+        largest = LARGEST[self.claim.n]
+        anew = HALVINGS[self.claim.n] and start == 0 and k % FROM_THE_CHEAPEST == 0
+        longer = min(1.0, 2 * length) if anew or proved.decay_margin <= LOW * largest else length
+        first_margin = min(self._lowered(proved.decay_margin, proved.margin), largest / longer)
         sizes = {case: max(map(size_of, pieces(each))) for case, each in proved.interval.cases.items()}
         halved = {case: least_halvings(each) for case, each in proved.interval.cases.items()}
         return ProofState(k, start, proved.rho, proved.interval.first, first_margin, longer, sizes, halved)
 
     def _lowered(self, decay_margin: float, margin: float) -> float:
         """A decay margin that the certificates' margin still allows, if that is much; the same if not."""
-        wasted = margin > max(WASTED[self.claim.n] * decay_margin, self._rates[0])
+        wasted = margin > max(WASTED * decay_margin, self._rates[0])
         return max(self._rates[0], decay_margin - RECLAIMED * margin) if wasted else decay_margin
 
     def _least_margin(self, k: int, start: float, end: float, state: ProofState) -> Proved | None:
@@ -370,29 +374,31 @@ def _squares(
     halve: int = 0,
     whole: float = -math.inf,
 ) -> Solution:
-    """By the first of the shapes with a margin of `enough`; where none has, by halves if these can have much more, and
-    only then by further monomials, if nothing else has a margin. `whole` is the margin of what this is a half of; it is
-    to be halved once more, `halve` times, at once.
+    """By the first of the shapes with a margin of `enough`; where none has, by halves as long as these have much more;
+    by further monomials only where nothing else has a margin. `whole` is the margin of what this is a half of; it is
+    halved `halve` times at once.
     """
     usual = [shape for shape in shapes if not (shape.further and effort.halvings)] or shapes
-    best = Solution(-math.inf) if halve and effort.halvings else _by_shapes(todo, usual, enough, effort, ended)
-    if best.margin == -math.inf and usual != shapes and _sampled(todo, usual[-1], effort.directions) <= 0:
+    if usual != shapes and _sampled(todo, usual[-1], effort.directions) <= 0:
         usual = shapes = shapes[-1:]
-        best = _by_shapes(todo, shapes, enough, effort, ended)
-    if best.margin >= enough:
-        return best
-    if effort.halvings and not best.margin - whole < GAIN * enough:
-        effort, least, halves = effort._replace(halvings=effort.halvings - 1), math.inf, []
+    best = Solution(-math.inf)
+    if not (halve and effort.halvings):
+        best = _by_shapes(todo, usual, enough, effort, ended)
+        if best.margin >= enough or best.margin - whole < GAIN * enough:
+            return best
+    if effort.halvings and not ended.is_set():
+        half_of, least, halves = effort._replace(halvings=effort.halvings - 1), math.inf, []
         for half in check.halves_of(todo):
-            found = _squares(half, shapes, enough, effort, ended, max(halve - 1, 0), best.margin)
+            found = _squares(half, usual, enough, half_of, ended, max(halve - 1, 0), best.margin)
             if found.squares is None:
-                return best
+                break
             least = min(least, found.margin)
             halves.append(found.squares)
-        return Solution(least, Halves(*halves))
+        else:
+            return Solution(least, Halves(*halves))
     if best.margin > 0 or usual == shapes:
         return best
-    return _by_shapes(todo, shapes[-1:], enough, effort, ended)
+    return _squares(todo, shapes[-1:], enough, effort, ended)
 
 
 def _by_shapes(todo: Obligation, shapes: list[Shape], enough: float, effort: Effort, ended: Event) -> Solution:
