@@ -33,8 +33,8 @@ LARGEST = {2: 0.1, 4: 0.06}
 """Decay margin [1/s] beyond which an interval is halved rather; of a part, over its length. The shortest have all."""
 RECLAIMED = 0.8
 """Share of the certificates' margin by which the decay margin is lowered."""
-WASTED = 1 / 4
-"""Share of the decay margin beyond which the certificates' margin is worth a second attempt."""
+WASTED = {2: 1 / 4, 4: 1 / 2}
+"""By the number of states: share of the decay margin beyond which the margin is worth a second attempt."""
 LOW = 0.35
 """Share of that up to which a decay margin is low: the next interval is twice as long."""
 SHORTEST = 1 / 16
@@ -213,7 +213,7 @@ class BackwardProof:
 
     def _lowered(self, decay_margin: float, margin: float) -> float:
         """A decay margin that the certificates' margin still allows, if that is much; the same if not."""
-        wasted = margin > max(WASTED * decay_margin, self._rates[0])
+        wasted = margin > max(WASTED[self.claim.n] * decay_margin, self._rates[0])
         return max(self._rates[0], decay_margin - RECLAIMED * margin) if wasted else decay_margin
 
     def _least_margin(self, k: int, start: float, end: float, state: ProofState) -> Proved | None:
