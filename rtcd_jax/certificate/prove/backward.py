@@ -24,19 +24,10 @@ from rtcd_jax.certificate.prove.levels import followed, unit_directions
 from rtcd_jax.certificate.prove.sdp import Shape, Solution
 from rtcd_jax.system.errors import UserError
 
-DECAY_MARGINS = {
-    2: (0.005, 0.015, 0.04, 0.1, 0.25, 0.6, 1.5, 4.0, 10.0, 25.0),
-    4: (0.02, 0.05, 0.1, 0.2, 0.5, 1.5, 4.0, 10.0, 25.0),
-}
-"""By the number of states: decay margins [1/s] in the order of trial."""
-LARGEST = {2: 0.1, 4: 0.06}
-"""Decay margin [1/s] beyond which an interval is halved rather; of a part, over its length. The shortest have all."""
 RECLAIMED = 0.8
 """Share of the certificates' margin by which the decay margin is lowered."""
-WASTED = {2: 1 / 4, 4: 1 / 2}
-"""By the number of states: share of the decay margin beyond which the margin is worth a second attempt."""
 LOW = 0.35
-"""Share of that up to which a decay margin is low: the next interval is twice as long."""
+"""Share of the largest decay margin up to which one is low: the next interval is twice as long."""
 SHORTEST = 1 / 16
 """Shortest fraction of the knots' interval."""
 FEWEST = 2
@@ -77,16 +68,49 @@ class Tier(NamedTuple):
         }
 
 
-TIERS = {
-    2: (Tier(5, 5, 3), Tier(5, 7, 4), Tier(5, 9, 5), Tier(5, 11, 6)),
-    4: (Tier(5, 3, 2), Tier(5, 5, 3), Tier(7, 8, 3, True), Tier(7, 9, 3, True)),
+class Strategy(NamedTuple):
+    """How robots of so many states are proved.
+
+    The decay margins [1/s] are in the order of trial. Beyond the `largest` one an interval is halved rather; of a part,
+    over its length; the shortest have all. The tiers are the cheapest first; `about_own_motions` are those of claims
+    with shifts. The squares have Bernstein polynomials of degree `bernstein` in s; in the proof of a case the interval
+    may be halved `halvings` times. A case whose margin is beyond the share `enough` of the decay margin needs no larger
+    program; a margin of all cases beyond the share `wasted` is worth a second attempt.
+    """
+
+    decay_margins: tuple[float, ...]
+    largest: float
+    tiers: tuple[Tier, ...]
+    about_own_motions: tuple[Tier, ...]
+    bernstein: int
+    halvings: int
+    enough: float
+    wasted: float
+
+
+STRATEGIES = {
+    2: Strategy(
+        decay_margins=(0.005, 0.015, 0.04, 0.1, 0.25, 0.6, 1.5, 4.0, 10.0, 25.0),
+        largest=0.1,
+        tiers=(Tier(5, 5, 3), Tier(5, 7, 4), Tier(5, 9, 5), Tier(5, 11, 6)),
+        about_own_motions=(Tier(5, 5, 3), Tier(5, 7, 4), Tier(5, 9, 5, stride=2), Tier(5, 11, 6, stride=2)),
+        bernstein=5,
+        halvings=0,
+        enough=1.0,
+        wasted=1 / 4,
+    ),
+    4: Strategy(
+        decay_margins=(0.02, 0.05, 0.1, 0.2, 0.5, 1.5, 4.0, 10.0, 25.0),
+        largest=0.06,
+        tiers=(Tier(5, 3, 2), Tier(5, 5, 3), Tier(7, 8, 3, True), Tier(7, 9, 3, True)),
+        about_own_motions=(Tier(5, 5, 3), Tier(5, 6, 3, True), Tier(7, 8, 3, True, 2)),
+        bernstein=3,
+        halvings=3,
+        enough=1 / 4,
+        wasted=1 / 2,
+    ),
 }
-"""By the number of states, the cheapest first."""
-TIERS_OF_OWN_MOTIONS = {
-    2: (Tier(5, 5, 3), Tier(5, 7, 4), Tier(5, 9, 5, stride=2), Tier(5, 11, 6, stride=2)),
-    4: (Tier(5, 5, 3), Tier(5, 6, 3, True), Tier(7, 8, 3, True, 2)),
-}
-"""As `TIERS`."""
+"""By the number of states."""
 HIGHEST_DEGREE = 3
 """In each of a robot's numbers about own motions: a number has one control point more."""
 ENOUGH_OF_DEGREES = 1.25
@@ -95,12 +119,6 @@ FROM_THE_CHEAPEST = 8
 """Knots after which programs begin with the cheapest again, instead of with those that were enough before, and four
 states with an interval twice as long.
 """
-BERNSTEIN = {2: 5, 4: 3}
-"""By the number of states: degree of the Bernstein polynomials in s. Models of two states have no higher order."""
-HALVINGS = {2: 0, 4: 3}
-"""By the number of states: how often an interval is halved in the proof of one of its cases."""
-ENOUGH = {2: 1.0, 4: 0.25}
-"""By the number of states: share of the decay margin beyond which a case's margin needs no larger program."""
 GAIN = 0.5
 """Times what is enough: where a half has so little more than the whole, it is not halved once more."""
 ERROR_FRACTION = 1 / 3
@@ -113,11 +131,11 @@ def tiers_of(n: int, moving: int) -> tuple[Tier, ...]:
     Raises:
         UserError: there are none.
     """
-    if n not in TIERS:
-        raise UserError(f"no certificate for {n} states: proofs are for {' and '.join(map(str, TIERS))}")
+    if n not in STRATEGIES:
+        raise UserError(f"no certificate for {n} states: proofs are for {' and '.join(map(str, STRATEGIES))}")
     tiers = tuple(
         tier
-        for tier in (TIERS_OF_OWN_MOTIONS if moving else TIERS)[n]
+        for tier in (STRATEGIES[n].about_own_motions if moving else STRATEGIES[n].tiers)
         if check.count_terms(n, tier.time_order, tier.order, (moving, tier.stride)) <= check.MAX_TERMS
     )
     if not tiers:
@@ -178,7 +196,8 @@ class BackwardProof:
         self, claim: Claim, loop: Loop, exact: bool, solver: str = program.SOLVER, pool: Executor | None = None
     ):
         self.claim, self.loop, self.exact, self.solver, self.pool = claim, loop, exact, solver, pool
-        self._directions, self._rates = unit_directions(claim.n), DECAY_MARGINS[claim.n]
+        self._directions, self._strategy = unit_directions(claim.n), STRATEGIES[claim.n]
+        self._rates = self._strategy.decay_margins
         self._tiers, self._degrees = tiers_of(claim.n, moving(claim)), degrees_of(claim)
 
     def outlet(self, rho: float) -> ProofState:
@@ -203,8 +222,8 @@ class BackwardProof:
     def after(self, proved: Proved) -> ProofState:
         """The state behind a proved interval. Where a low decay margin was enough, the next one is longer."""
         k, start, length = proved.interval.knot, float(proved.interval.start), proved.length
-        largest = LARGEST[self.claim.n]
-        anew = HALVINGS[self.claim.n] and start == 0 and k % FROM_THE_CHEAPEST == 0
+        largest = self._strategy.largest
+        anew = self._strategy.halvings and start == 0 and k % FROM_THE_CHEAPEST == 0
         longer = min(1.0, 2 * length) if anew or proved.decay_margin <= LOW * largest else length
         first_margin = min(self._lowered(proved.decay_margin, proved.margin), largest / longer)
         sizes = {case: max(map(size_of, pieces(each))) for case, each in proved.interval.cases.items()}
@@ -213,13 +232,13 @@ class BackwardProof:
 
     def _lowered(self, decay_margin: float, margin: float) -> float:
         """A decay margin that the certificates' margin still allows, if that is much; the same if not."""
-        wasted = margin > max(WASTED[self.claim.n] * decay_margin, self._rates[0])
+        wasted = margin > max(self._strategy.wasted * decay_margin, self._rates[0])
         return max(self._rates[0], decay_margin - RECLAIMED * margin) if wasted else decay_margin
 
     def _least_margin(self, k: int, start: float, end: float, state: ProofState) -> Proved | None:
         """The interval with nearly the least decay margin with which it can be proved."""
         length, first = end - start, state.first_margin
-        largest = LARGEST[self.claim.n] / length if length > SHORTEST else np.inf
+        largest = self._strategy.largest / length if length > SHORTEST else np.inf
         for rate in (first, *(rate for rate in self._rates if first < rate <= largest)):
             proved = self._attempt(k, start, end, state, rate)
             if proved is not None:
@@ -237,13 +256,13 @@ class BackwardProof:
             if self.claim.first_order:
                 check.require_jump(self.claim, interval, "jumps")
             interval, todo, tier = self._models(interval, decay_margin)
-            n = self.claim.n
-            shapes = tier.shapes(todo, self.loop, FEWEST, BERNSTEIN[n])
+            shapes = tier.shapes(todo, self.loop, FEWEST, self._strategy.bernstein)
             halved = state.halved if k % FROM_THE_CHEAPEST else {}
             if self.claim.shifts and k % FROM_THE_CHEAPEST:  # of their many programs
                 shapes = {case: _from(each, state.sizes.get(case, (0, 0))) for case, each in shapes.items()}
-            effort = Effort(self._directions, self.solver, HALVINGS[n], halved)
-            proof = prove(todo, shapes, ENOUGH[n] * decay_margin, self.exact, effort, self.pool)
+            effort = Effort(self._directions, self.solver, self._strategy.halvings, halved)
+            enough = self._strategy.enough * decay_margin
+            proof = prove(todo, shapes, enough, self.exact, effort, self.pool)
         except Refused:
             return None
         if proof is None:
