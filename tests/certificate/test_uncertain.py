@@ -253,6 +253,8 @@ def test_older_files_have_two_free_cases(content):
     one, two = (check.cases_of(space, claim, Q(0), Q(1, 2), asked, Q(-1), Q(1), joined=j) for j in (True, False))
     assert set(two) - set(one) == {"free-", "free+"}
     assert {name: two[name] for name in two.keys() & one.keys()} == {name: one[name] for name in one if name != "free"}
+    late = check.cases_of(space, claim, Q(0), Q(1, 2), asked, Q(-1), Q(1), asked, joined=False)
+    assert set(late) == set(two) | {f"{name}late" for name in two}
     for angle in np.linspace(0, 2 * np.pi, 100):
         y = np.array([np.cos(angle), np.sin(angle)])
         holds = {

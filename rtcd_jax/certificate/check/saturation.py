@@ -67,8 +67,9 @@ def cases_of(
     its laws. `joined`: laws that differ in the limit alone have one case "free".
     """
     if oldest is not None:
-        now = cases_of(space, claim, error, feedforward, feedback, low, high)
-        then = cases_of(space, claim, error, feedforward, oldest, low, high)
+        now, then = (
+            cases_of(space, claim, error, feedforward, each, low, high, joined=joined) for each in (feedback, oldest)
+        )
         return now | {f"{name}late": case for name, case in then.items()}
     weak, strong = claim.limits
     w, linear, apart = claim.disturbance, feedback.linear, space.size(feedback.offset)
