@@ -8,7 +8,8 @@ from itertools import combinations_with_replacement
 from typing import Any, NamedTuple
 
 from rtcd_jax.certificate.check.exact import Q, require, rounded, up
-from rtcd_jax.certificate.check.taylor import chebyshev, peak, polynomial, terms_of
+from rtcd_jax.certificate.check.matrix import dot
+from rtcd_jax.certificate.check.taylor import chebyshev, economize, peak, polynomial, terms_of
 
 
 class Obligation(NamedTuple):
@@ -77,33 +78,19 @@ def reduced(exponents: tuple[int, ...]) -> tuple[tuple[tuple[int, ...], int], ..
     return tuple(total.items())
 
 
+def expanded(k: int, a, b) -> list:
+    """Coefficients of (a + b t)^k."""
+    return [math.comb(k, i) * a ** (k - i) * b**i for i in range(k + 1)]
+
+
 @lru_cache(1000)
 def basis_change(order: int, degree: int, low, high) -> tuple:
     """Row k: s^k in the Bernstein polynomials of `degree` on [low, high]."""
-    rows, width = [], high - low
+    rows = []
     for k in range(order + 1):
-        powers = [math.comb(k, i) * low ** (k - i) * width**i for i in range(k + 1)]
+        powers = expanded(k, low, high - low)
         rows.append([sum((p * Q(math.comb(j, i), math.comb(degree, i)) for i, p in enumerate(powers[: j + 1])), Q(0))
                      for j in range(degree + 1)])  # fmt: skip
-    return tuple(rows)
-
-
-@lru_cache(1000)
-def economizing_basis_change(order: int, degree: int, low, high) -> tuple:
-    """As `basis_change` where degree < order: row k has the coefficients in the Bernstein polynomials of what s^k is
-    without the Chebyshev polynomials T_{degree+1} ... T_order of [low, high], then those of these.
-    """
-    to_bernstein, rows = basis_change(degree, degree, Q(-1), Q(1)), []
-    middle, half = (low + high) / 2, (high - low) / 2
-    for k in range(order + 1):
-        powers = [math.comb(k, i) * middle ** (k - i) * half**i for i in range(k + 1)]
-        lost = [Q(0)] * (order - degree)
-        for i in range(k, degree, -1):
-            lost[i - degree - 1] = share = powers[i] / 2 ** (i - 1)
-            powers = [a - share * t for a, t in zip(powers, chebyshev(i), strict=False)]
-        columns = zip(*to_bernstein, strict=True)
-        kept = [sum((a * b for a, b in zip(powers, column, strict=False)), Q(0)) for column in columns]
-        rows.append((*kept, *lost))
     return tuple(rows)
 
 
@@ -111,19 +98,23 @@ def bernstein(p, degree: int, low, high) -> tuple[list[dict], Any]:
     """Bernstein coefficients in s, each a polynomial in y on the sphere by exponents, and by how much they may differ
     from p, which they do where its order in s is above their degree.
     """
-    by_y: dict[tuple[int, ...], dict[int, Any]] = {}
-    for e, c in terms_of(p):
-        by_y.setdefault(e[1:], {})[e[0]] = c
-    order = max((k for powers in by_y.values() for k in powers), default=0)
-    rows = (basis_change if order <= degree else economizing_basis_change)(order, degree, low, high)
-    parts: list[dict] = [{} for _ in rows[0]]
-    for e, powers in by_y.items():
-        values = [sum((c * rows[k][j] for k, c in powers.items()), Q(0)) for j in range(len(parts))]
-        for f, k in reduced(e):
-            for part, value in zip(parts, values, strict=True):
-                part[f] = part.get(f, 0) + value * k
-    error = sum((abs(c) * peak(e) for part in parts[degree + 1 :] for e, c in part.items()), Q(0))
-    return parts[: degree + 1], error
+    terms = terms_of(p)
+    order = max((e[0] for e, _ in terms), default=0)
+    by_y: dict[tuple[int, ...], list] = {}
+    for e, c in terms:
+        for f, k in reduced(e[1:]):
+            by_y.setdefault(f, [Q(0)] * (order + 1))[e[0]] += c * k
+    error = Q(0)
+    if order > degree:
+        rows = [expanded(k, (low + high) / 2, (high - low) / 2) for k in range(order + 1)]
+        low, high = Q(-1), Q(1)
+        for f, powers in by_y.items():
+            scaled = [sum((powers[k] * rows[k][i] for k in range(i, order + 1)), Q(0)) for i in range(order + 1)]
+            by_y[f], cut = economize(scaled, 1, degree)
+            error += cut * peak(f)
+    columns = list(zip(*basis_change(min(order, degree), degree, low, high), strict=True))
+    parts = [{f: dot(powers, column) for f, powers in by_y.items()} for column in columns]
+    return parts, error
 
 
 def condition(g, n: int, degree: int, low, high) -> list[dict]:

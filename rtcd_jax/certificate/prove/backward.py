@@ -398,13 +398,14 @@ def _squares(
     halved `halve` times at once.
     """
     usual = [shape for shape in shapes if not (shape.further and effort.halvings)] or shapes
-    if usual != shapes and _sampled(todo, usual[-1], effort.directions) <= 0:
-        usual = shapes = shapes[-1:]
-    best = Solution(-math.inf)
-    if not (halve and effort.halvings):
-        best = _by_shapes(todo, usual, enough, effort, ended)
-        if best.margin >= enough or best.margin - whole < GAIN * enough:
-            return best
+    at_once = halve and effort.halvings
+    best = Solution(-math.inf) if at_once else _by_shapes(todo, usual, enough, effort, ended)
+    if best.margin >= enough:
+        return best
+    if best.margin == -math.inf and usual != shapes and _sampled(todo, usual[-1], effort.directions) <= 0:
+        return _squares(todo, shapes[-1:], enough, effort, ended, halve, whole)
+    if best.margin - whole < GAIN * enough:
+        return best
     if effort.halvings and not ended.is_set():
         half_of, least, halves = effort._replace(halvings=effort.halvings - 1), math.inf, []
         for half in check.halves_of(todo):
