@@ -8,10 +8,12 @@ from typing import Any, final
 from rtcd_jax.analysis.report.reading import Run, read_run
 from rtcd_jax.analysis.report.tables import Cell, candidate, gains, verdict
 from rtcd_jax.analysis.report.words import duration, guarantee, listed, ratio, volume_unit, words
+from rtcd_jax.certificate.standing import open_cycle
 from rtcd_jax.config.load import Config, differences
 from rtcd_jax.elite.records import (
     INITIAL,
     elite_names,
+    is_cycle,
     read_config,
     read_elite,
     read_generations,
@@ -122,7 +124,11 @@ def show_run(path: Path, console: Console) -> Iterator[str]:
         first, last = _over_tasks(path, search.objective)
         over = f"{words(search.over_tasks)} over {len(course.config.tasks)} tasks"
         yield f"{words(search.objective)}, {over}: initial {first:.4g}, best {last:.4g} (sampled)"
-        yield from resets_in_words(read_elite(path / "elites", elite_names(path)[0])[1])
+        name = elite_names(path)[0]
+        yield from resets_in_words(read_elite(path / "elites", name)[1])
+        if is_cycle(path):
+            why = open_cycle(path, name)
+            yield f"cycle: none proved, {why}; rtcd certify {path}" if why else "cycle: proved"
         for folder in task_folders(path):
             yield f"task {folder.name}:"
             yield from show_run(folder, console)
@@ -142,9 +148,7 @@ def show_run(path: Path, console: Console) -> Iterator[str]:
     )
     yield f"guarantee: {guarantee(run.best.record)}"
     certificate = run.certificates.get("000")
-    if task.caught:
-        yield "proof: none of a catch set"
-    elif certificate is None:
+    if certificate is None:
         yield f"proof: none yet; rtcd certify {path}"
     elif certificate.guarantee is None:
         yield f"proof: none, certificate {certificate.verdict}: {certificate.reason}"

@@ -1,7 +1,8 @@
 """Whether a stored certificate proves a stored elite: the one answer that reports and exports give.
 
 It does if the checker accepts the very file, and if the closed loop that the file claims is the elite's: robot,
-parameters, limits, dt, x, u, K, x_goal and K_goal bit by bit, and the rates to within their rounding.
+parameters, limits, dt, x, u, K, x_goal and K_goal bit by bit, and the rates, a reset and a catch set to within their
+rounding.
 
 Checking takes seconds. Verdicts are therefore cached in the user's own cache, by the digests of the file and of the
 checker's source. No verdict is read from a run folder, which may come from anybody.
@@ -25,6 +26,7 @@ from rtcd_jax.certificate.check import Claim, Damaged, Node, Refused, Report, Un
 from rtcd_jax.certificate.prove.closed_loop import claim_of
 from rtcd_jax.certificate.prove.robot import ClaimedRobot, claimed_robot
 from rtcd_jax.elite.elite import Elite
+from rtcd_jax.elite.records import task_folders
 from rtcd_jax.system.errors import UserError, printable
 from rtcd_jax.system.files import replace_json, user_cache
 
@@ -33,6 +35,9 @@ RATE_ROUNDING = 1e-12
 
 FUNCTION_ROUNDING = 1e-12
 """Share of the largest coefficient by which another derivation may round a function of the robot."""
+
+SET_ROUNDING = 1e-6
+"""Share of the elite's last level by which a catch set's may be larger."""
 
 ROBOTS = 8
 """Of a box, by which functions of its numbers are told apart: two that differ are equal almost nowhere."""
@@ -106,6 +111,23 @@ def standing_of(
     return _remembered(digest) or _checked(content, digest, progress)
 
 
+def open_cycle(run: Path, name: str) -> str:
+    """Why the certificates of a cycle's tasks do not prove it for the elite NAME; empty if they do."""
+    motions = []
+    for folder in task_folders(run):
+        found = standing(folder, name)
+        if not found.proved:
+            return f"the certificate of {folder.name} is {found.verdict}"
+        content = check.parse(check.read_bytes(certificate_path(folder, name)))
+        claim = check.read_claim(Node("certificate.claim", content["claim"]))
+        motions.append((claim, check.read_interval(Node("funnel[0]", content["funnel"][0]), claim).first))
+    try:
+        check.require_cycle(motions)
+    except Refused as refused:
+        return str(refused)
+    return ""
+
+
 def difference(content: Mapping[str, Any], claim: Claim, elite: Elite) -> str:
     """The first number of a claim that is not the stored elite's, with both; empty if there is none.
 
@@ -133,7 +155,9 @@ def difference(content: Mapping[str, Any], claim: Claim, elite: Elite) -> str:
     theirs, ours = (about.get("keep_out", []) for about in (content, stored))
     if check.digest(theirs) != check.digest(ours):
         return f"keep_out has {len(theirs)} sets there, {len(ours)} in the elite, and these are not the same"
-    for key in _OF_THE_LOOP:
+    if text := _another_end(claim, elite):
+        return text
+    for key in (key for key in _OF_THE_LOOP if key in stored):
         text = _difference(key, content[key], stored[key], RATE_ROUNDING * largest if key == "rates" else 0.0)
         if text:
             return text
@@ -142,6 +166,43 @@ def difference(content: Mapping[str, Any], claim: Claim, elite: Elite) -> str:
 
 _OF_THE_LOOP = ("state_limits", "dt", "x", "u", "K", "x_goal", "K_goal", "rates")
 """The rates last: they follow from the others."""
+
+
+def _another_end(claim: Claim, elite: Elite) -> str:
+    """Why a claim's motion does not end in the elite's way: held at the goal, in its catch set, or behind its reset."""
+    if (claim.catch is not None) != elite.caught:
+        return "its motion is held at the goal, and one of them ends in a catch set"
+    if claim.catch is None:
+        return ""
+    catch, cyclic = claim.catch, "reset" in elite.record["catch"]
+    if catch.reset is None:
+        axes = np.array([[float(c) for c in row] for row in catch.axes])
+        inside = np.linalg.eigvalsh(axes.T @ elite.S[-1] @ axes)[-1] <= elite.rho[-1] * (1 + SET_ROUNDING)
+        there = all(float(c) == x for c, x in zip(catch.center, elite.x_goal, strict=True))
+        return "" if inside and there else "its catch set is not in the elite's"
+    if not cyclic:
+        return "its motion ends with a reset there"
+    from rtcd_jax.certificate.prove.reset import reset_of  # which needs JAX, as few others do here
+
+    ours, theirs = reset_of(elite), catch.reset
+    numbers = claimed_robot(elite).numbers
+    same = (theirs.positions, theirs.turns) == (ours.positions, ours.turns) and all(
+        _same_number(theirs.numbers[name], ours.numbers[name]) for name in ours.numbers
+    )
+    if not same:
+        return "its reset is another one there"
+    pair = (_coefficients(each.momentum, numbers) for each in (theirs, ours))
+    for a, b in zip(*pair, strict=True):
+        if _differ(a, b):
+            return "its reset's momentum is another one there"
+    return ""
+
+
+def _same_number(theirs: Any, ours: Any) -> bool:
+    """Two names, or two numbers up to their rounding."""
+    if isinstance(theirs, str) or isinstance(ours, str):
+        return theirs == ours
+    return abs(float(theirs) - float(ours)) <= FUNCTION_ROUNDING * abs(float(ours))
 
 
 def _robots(claim: Claim, robot: ClaimedRobot, elite: Elite) -> Iterator[dict[str, float]]:
@@ -169,11 +230,16 @@ def _another(theirs: check.Robot, ours: check.Robot, numbers: Mapping[str, float
     for key in ("mass", "potential", "damping", "motor"):
         pair = (_coefficients(getattr(robot, key), numbers) for robot in (theirs, ours))
         for place, a, b in zip(itertools.count(), *pair, strict=False):
-            largest = max((np.abs(c).max() for c in b.values()), default=0.0)
-            terms = [k for k in {*a, *b} if key != "potential" or any(k)]
-            if any(np.abs(a.get(k, 0.0) - b.get(k, 0.0)).max() > FUNCTION_ROUNDING * largest for k in terms):
+            if _differ(a, b, constant=key != "potential"):
                 return f"robot.{key}: function {place} is another there"
     return ""
+
+
+def _differ(theirs: Mapping[tuple[int, ...], Any], ours: Mapping[tuple[int, ...], Any], constant: bool = True) -> bool:
+    """Whether coefficients by the term's joints differ beyond rounding; `constant`: that of no joint counts, too."""
+    largest = max((np.abs(c).max() for c in ours.values()), default=0.0)
+    terms = [k for k in {*theirs, *ours} if constant or any(k)]
+    return any(np.abs(theirs.get(k, 0.0) - ours.get(k, 0.0)).max() > FUNCTION_ROUNDING * largest for k in terms)
 
 
 def _coefficients(functions: Any, numbers: Mapping[str, float]) -> list[dict[tuple[int, ...], Any]]:

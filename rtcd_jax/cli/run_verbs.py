@@ -357,14 +357,18 @@ class CertifyOptions(Options):
 
 
 def certify(options: CertifyOptions, console: Console) -> Exit:
+    from rtcd_jax.certificate.prove.cycle import close_cycle
     from rtcd_jax.certificate.prove.run import certify_run
-    from rtcd_jax.elite.records import elite_name
+    from rtcd_jax.elite.records import elite_name, is_cycle, require_elites
 
     workers, only = options.workers or cores(), None if options.elite is None else elite_name(options.elite)
     how = options.optimize_value, options.uncertainty, options.solver, options.share, only
     with heeding_sigterm():
         folders = _each_task(options.run, console)
         goals = [certify_run(each, options.elites, options.guarantee, workers, console, *how) for each in folders]
+        if is_cycle(options.run):
+            names = require_elites(options.run)[: options.elites] if only is None else [only]
+            goals.append(close_cycle(options.run, names, options.guarantee, options.solver, console))
         return _verdict(all(goals))
 
 

@@ -166,9 +166,7 @@ def _headlines(run: Run) -> Iterator[tuple[str, str, str]]:
         yield of_the_best, value, f"{remark}, searched" if name == objective else remark
     yield "swing-up", duration(float(run.best.time[-1])), "of the best, start to goal"
     certificate = run.certificates.get("000")
-    if run.config.task.caught:
-        yield "proof", "none", "of a catch set"
-    elif certificate is None:
+    if certificate is None:
         yield "proof", "none yet", "rtcd certify"
     elif certificate.guarantee is None:
         yield "proof", "none", f"certificate {certificate.verdict}"
@@ -323,8 +321,7 @@ def _push_margin(run: Run, push: Mapping[str, float | None]) -> str:
 def _certified(runs: Sequence[Run]) -> Iterator[str]:
     certificates = tables.certificates(runs)
     if certificates is None:
-        caught = all(run.config.task.caught for run in runs)
-        yield note("None: there is no proof of a catch set." if caught else "Nothing yet: rtcd certify RUN.")
+        yield note("Nothing yet: rtcd certify RUN.")
         return
     yield table(certificates)
     for run in runs:

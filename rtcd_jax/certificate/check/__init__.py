@@ -71,8 +71,10 @@ Every number of a file is an exact double in hexadecimal notation. Digests show 
 does not rest on them.
 """
 
-from rtcd_jax.certificate.check.claim import Claim, Shift
+from rtcd_jax.certificate.check.catch import catch_obligations
+from rtcd_jax.certificate.check.claim import Catch, Claim, Reset, Shift
 from rtcd_jax.certificate.check.command import SECONDS, main, within
+from rtcd_jax.certificate.check.cycle import require_cycle
 from rtcd_jax.certificate.check.delay import jumps_within_reach, lateness
 from rtcd_jax.certificate.check.exact import (
     MAX_TERMS,

@@ -4,7 +4,7 @@ from typing import Any, NamedTuple
 
 from rtcd_jax.certificate.check.exact import Q
 from rtcd_jax.certificate.check.keep_out import Ellipsoid
-from rtcd_jax.certificate.check.robot import Equations, Robot
+from rtcd_jax.certificate.check.robot import Equations, Function, Robot
 from rtcd_jax.certificate.check.taylor import Space
 
 
@@ -19,6 +19,27 @@ class Shift(NamedTuple):
     rates: list
 
 
+class Reset(NamedTuple):
+    """What happens at t_N: q+ = `positions` q + pi `turns`, and M+(q+) v+ = `momentum`(q) v.
+
+    M+ is the mass matrix of the same robot with other `numbers`, each by the name of the one whose value it takes, or
+    an exact one.
+    """
+
+    positions: list[list[int]]
+    turns: list[int]
+    numbers: dict[str, Any]
+    momentum: tuple[tuple[Function, ...], ...]
+
+
+class Catch(NamedTuple):
+    """Where the motion ends, at t_N: the states are in {center + axes y : |y| <= 1}, or are led there by the reset."""
+
+    center: list
+    axes: list
+    reset: Reset | None
+
+
 class Claim(NamedTuple):
     """The closed loops that the proof is about.
 
@@ -27,7 +48,8 @@ class Claim(NamedTuple):
     is, `speed` [input/s] how fast the feedback changes. Where old measurements count to first order (delay.py), `jerk`
     [input/s^2], `reaction` [1/s] and, by knot, `jumps` [input/s] bound how that changes; else `jerk` is None. A motion
     on x* survives an impulse of |J| <= `push` [input s] on the motor. No motion enters the sets of `keep_out`. With
-    `shifts` the robot's numbers are constant, and each robot p has its funnel about c_p instead of x*.
+    `shifts` the robot's numbers are constant, and each robot p has its funnel about c_p instead of x*. A motion that
+    ends in a `catch` has no goal to be held at: `x_goal` and `K_goal` are empty.
     """
 
     equations: Equations
@@ -52,6 +74,7 @@ class Claim(NamedTuple):
     push: Any
     keep_out: list = []  # noqa: RUF012 (of a tuple's field)
     shifts: tuple[Shift, ...] = ()
+    catch: Catch | None = None
 
     @property
     def robot(self) -> Robot:
@@ -59,7 +82,7 @@ class Claim(NamedTuple):
 
     @property
     def n(self) -> int:
-        return len(self.x_goal)
+        return len(self.robot.states)
 
     @property
     def ellipsoids(self) -> list[Ellipsoid]:
@@ -93,6 +116,14 @@ class Claim(NamedTuple):
 
     def space(self, s_order: int, y_order: int, stride: int = 0) -> Space:
         return Space(self.n, s_order, y_order, len(self.uncertain), stride)
+
+    @property
+    def ranges_after(self) -> dict[str, tuple[Any, Any]]:
+        """The least and the largest value of each of the robot's numbers after the reset."""
+        assert self.catch is not None
+        assert self.catch.reset is not None
+        after = self.catch.reset.numbers
+        return {name: self.parameters[a] if isinstance(a, str) else (a, a) for name, a in after.items()}
 
     def numbers(self, space: Space) -> dict[str, Any]:
         """The robot's numbers by name: an exact one, or all between its bounds."""

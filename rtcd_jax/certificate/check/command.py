@@ -1,4 +1,4 @@
-"""`rtcd check FILE`: what is proved in plain words, or where the proof fails."""
+"""`rtcd check FILE`: what is proved in plain words, or where the proof fails; `--cycle` of several files together."""
 
 import hashlib
 import signal
@@ -8,9 +8,10 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
+from rtcd_jax.certificate.check.cycle import cycle_sentence, require_cycle
 from rtcd_jax.certificate.check.exact import Refused, Undecided, printable
 from rtcd_jax.certificate.check.file import parse, read_bytes
-from rtcd_jax.certificate.check.verdict import check_file, sentence
+from rtcd_jax.certificate.check.verdict import Report, check_file, sentence
 
 SECONDS = 600.0
 """For a stranger's file; the cart-pole's take 40 with python-flint."""
@@ -18,11 +19,13 @@ LONGEST_NOTE = 79
 """Characters of a line that holds a note: it stays one line on a terminal."""
 USAGE = f"""\
 usage: rtcd check FILE [--seconds N] [--controller LAB]
+       rtcd check --cycle FILE FILE [...] [--seconds N]
 
 Check a certificate, certificates/NNN.json of a run folder, by exact arithmetic, without any solver. Exit code 0 only
 if all of it holds; 1 if it is refused, with the place and the reason; 2 if it is undecided or there is nothing to read.
 
   --seconds N       give up after so many seconds of wall clock [s] (> 0, default {SECONDS:g})
+  --cycle           also: does each motion end where the next one begins, the last where the first does?
   --controller LAB  also: was this folder of `rtcd export` made from the certificate's claim, and is it as it was made?
 
 Example: rtcd check checkpoints/pendulum_rtcd/certificates/000.json"""
@@ -34,14 +37,20 @@ def main(arguments: Sequence[str]) -> int:
         print(USAGE)
         return 0
     try:
-        file, seconds, lab = options_of(arguments)
+        files, seconds, lab, cycle = options_of(arguments)
     except ValueError as error:
         print(f"rtcd check: {printable(error)}", file=sys.stderr)
         return 2
+    reports: list[Report] = []
+    file, compared = files[0], ""
     try:
         with within(seconds):
-            report = check_file(Path(file), _counted)
-            compared = compare(Path(lab), report.digest) if lab is not None else ""
+            for file in files:
+                reports.append(check_file(Path(file), _counted))
+            if cycle:
+                require_cycle([(report.claim, report.inlet) for report in reports])
+            if lab is not None:
+                compared = compare(Path(lab), reports[0].digest)
     except OSError as error:
         print(f"{printable(error.filename)}: {error.strerror}; a certificate is RUN/certificates/NNN.json"
               + ", a controller the folder of `rtcd export`" * (lab is not None), file=sys.stderr)  # fmt: skip
@@ -50,11 +59,15 @@ def main(arguments: Sequence[str]) -> int:
         print(f"{printable(file)}: {undecided}", file=sys.stderr)
         return 2
     except Refused as refused:
-        print(f"REFUSED {printable(file)}\n{refused}", file=sys.stderr)
+        which = " ".join(files) if len(reports) == len(files) else file
+        print(f"REFUSED {printable(which)}\n{refused}", file=sys.stderr)
         return 1
-    print(sentence(report))
-    for key, value in report.notes.items():
-        print(printable(f"note of the file's author, not proved: {key}: {value}", LONGEST_NOTE))
+    for report in reports:
+        print(sentence(report))
+        for key, value in report.notes.items():
+            print(printable(f"note of the file's author, not proved: {key}: {value}", LONGEST_NOTE))
+    if cycle:
+        print(cycle_sentence([report.digest for report in reports]))
     if compared:
         print(f"NOT THE CONTROLLER OF THIS CERTIFICATE: {printable(lab)}: {compared}", file=sys.stderr)
         return 1
@@ -63,12 +76,18 @@ def main(arguments: Sequence[str]) -> int:
     return 0
 
 
-def options_of(arguments: Sequence[str]) -> tuple[str, float, str | None]:
-    """The file, the seconds and the controller's folder. Raises ValueError, which says what would have been right."""
+def options_of(arguments: Sequence[str]) -> tuple[list[str], float, str | None, bool]:
+    """The files, the seconds, the controller's folder, and whether the files are a cycle. Raises ValueError, which says
+    what would have been right.
+    """
     files: list[str] = []
     given: dict[str, str] = {}
     rest = iter(arguments)
+    cycle = False
     for word in rest:
+        if word == "--cycle":
+            cycle = True
+            continue
         name, equals, value = word.partition("=")
         if name in ("--seconds", "--controller"):
             value = value if equals else next(rest, "")
@@ -76,10 +95,12 @@ def options_of(arguments: Sequence[str]) -> tuple[str, float, str | None]:
                 raise ValueError(f"{name}: must be followed by its value")
             given[name] = value
         elif word.startswith("--"):
-            raise ValueError(f"unknown option {name}; valid: --seconds, --controller")
+            raise ValueError(f"unknown option {name}; valid: --seconds, --controller, --cycle")
         else:
             files.append(word)
-    if len(files) != 1:
+    if cycle and (not files or "--controller" in given):
+        raise ValueError("--cycle: must be followed by the certificates of all its motions, without --controller")
+    if len(files) != 1 and not cycle:
         raise ValueError(f"{len(files)} files: must be one, as in `rtcd check RUN/certificates/000.json`")
     text = given.get("--seconds", SECONDS)
     try:
@@ -88,7 +109,7 @@ def options_of(arguments: Sequence[str]) -> tuple[str, float, str | None]:
         seconds = 0.0
     if not 0 < seconds <= 1e6:
         raise ValueError(f"--seconds {text}: must be a number > 0 and <= 1e6")
-    return files[0], seconds, given.get("--controller")
+    return files, seconds, given.get("--controller"), cycle
 
 
 @contextmanager

@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from rtcd_jax.certificate.check.claim import Claim, Shift
+from rtcd_jax.certificate.check.claim import Catch, Claim, Reset, Shift
 from rtcd_jax.certificate.check.exact import (
     MAX_BYTES,
     MAX_FURTHER,
@@ -48,7 +48,7 @@ MOST_UNCERTAIN = 6
 """Numbers of a robot."""
 MOST_SHIFTS, HIGHEST_SHIFT = 20, 3
 """Of the centers' parts, and the highest power of a number in one."""
-_CASE = re.compile(r"(free|high|low)[-+]?(late)?(/[0-9]{1,3}(,[0-9]{1,3})*)?")
+_CASE = re.compile(r"((free|high|low)[-+]?(late)?|caught)(/[0-9]{1,3}(,[0-9]{1,3})*)?")
 _DOUBLE = re.compile(r"-?0x[01](\.[0-9a-f]{1,13})?p[+-][0-9]{1,4}")
 
 
@@ -140,8 +140,10 @@ def read_claim(node: Node) -> Claim:
     first_order = isinstance(node.value, dict) and "jerk" in node.value
     kept_out = isinstance(node.value, dict) and "keep_out" in node.value
     shifted = isinstance(node.value, dict) and "shifts" in node.value
+    caught = isinstance(node.value, dict) and "catch" in node.value
     names = (
         *("robot", "parameters", "limit", "disturbance", "noise", "age", "speed", *_LOOP, "push"),
+        *(("catch",) if caught else _GOAL),
         *(("jerk", "reaction", "jumps") if first_order else ()),
         *(("keep_out",) if kept_out else ()),
         *(("shifts",) if shifted else ()),
@@ -179,7 +181,34 @@ def read_claim(node: Node) -> Claim:
         else [],
         keep_out=[_read_set(each, n) for each in entries["keep_out"].items(at_least=1)] if kept_out else [],
         shifts=_read_shifts(entries["shifts"], parameters, len(entries["x"].items()), n) if shifted else (),
+        catch=_read_catch(entries["catch"], robot, parameters) if caught else None,
     )
+
+
+def _read_catch(node: Node, robot: Robot, parameters: Mapping[str, Any]) -> Catch:
+    n = len(robot.states)
+    resets = isinstance(node.value, dict) and "reset" in node.value
+    center, axes, *reset = node.keys("center", "axes", *(("reset",) if resets else ()))
+    node.require_digests()
+    return Catch(center.array(n), axes.array(n, n), _read_reset(reset[0], robot, parameters) if resets else None)
+
+
+def _read_reset(node: Node, robot: Robot, parameters: Mapping[str, Any]) -> Reset:
+    joints = len(robot.joints)
+    node.require(len(robot.hinges) == joints, "needs a robot whose joints are all hinges")
+    positions, turns, numbers, momentum = node.keys("positions", "turns", "numbers", "momentum")
+    node.require_digests()
+    rows = [[k.integer(-HIGHEST, HIGHEST) for k in row.items(joints)] for row in positions.items(joints)]
+    after = dict(numbers.named())
+    numbers.require(after.keys() == parameters.keys(), f"must be the robot's, {', '.join(sorted(parameters))[:80]}")
+    values = {}
+    for name, value in after.items():
+        values[name] = value.value if value.value in tuple(parameters) else value.number()
+    functions = [[_read_function(entry, robot.joints) for entry in row.items(joints)] for row in momentum.items(joints)]
+    used = {name for row in functions for entry in row for term in entry for name, _ in term.powers}
+    momentum.require(used <= parameters.keys(), f"must be of the robot's numbers, {', '.join(sorted(parameters))[:80]}")
+    half_turns = [each.integer(-HIGHEST, HIGHEST) for each in turns.items(joints)]
+    return Reset(rows, half_turns, values, tuple(map(tuple, functions)))
 
 
 def _read_shifts(node: Node, parameters: Mapping[str, tuple[Any, Any]], knots: int, n: int) -> tuple[Shift, ...]:
@@ -224,11 +253,12 @@ def _read_sides(node: Node, claim: Claim, ends: int) -> list[tuple]:
     return sides
 
 
-_LOOP = ("state_limits", "dt", "x", "rates", "u", "K", "x_goal", "K_goal", "start")
+_LOOP = ("state_limits", "dt", "x", "rates", "u", "K", "start")
+_GOAL = ("x_goal", "K_goal")
 
 
 def _read_claim_1(node: Node) -> Claim:
-    names = ("plant", "parameters", *_LOOP)
+    names = ("plant", "parameters", *_LOOP, *_GOAL)
     entries: dict[str, Node] = dict(zip(names, node.keys(*names), strict=True))
     node.require_digests()
     entries["plant"].require(entries["plant"].value in tuple(PLANTS), f"must be one of {', '.join(PLANTS)}")
@@ -260,7 +290,8 @@ def _claim(entries: Mapping[str, Node], equations: Equations, parameters, limits
     return Claim(
         equations, parameters, limits, bounds=bounds, dt=dt, x=entries["x"].array(knots, n),
         rates=entries["rates"].array(knots - 1, 2, n), u=entries["u"].array(knots - 1), K=entries["K"].array(knots, n),
-        x_goal=entries["x_goal"].array(n), K_goal=entries["K_goal"].array(n),
+        x_goal=entries["x_goal"].array(n) if "x_goal" in entries else [],
+        K_goal=entries["K_goal"].array(n) if "K_goal" in entries else [],
         start=(start[0].integer(0, knots - 1), start[1].number()), **acts,
     )  # fmt: skip
 
@@ -439,6 +470,14 @@ def read_goal(node: Node, claim: Claim) -> Goal:
         more[int(ended)].array(claim.n) if claim.first_order else [],
         _read_sides(more[-1], claim, 1) if claim.ellipsoids else [],
     )  # fmt: skip
+
+
+def read_catch(node: Node, claim: Claim) -> tuple[int, dict[str, Squares]]:
+    """The order of the Taylor models in y, and the squares."""
+    order, cases = node.keys("order", "cases")
+    node.require_digests()
+    require_few_terms(order, claim.n, 0, order.integer(2, MAX_ORDER - 2))  # each power of y has the same one of l
+    return order.value, read_cases(cases, claim.n)
 
 
 def read_notes(node: Node) -> dict[str, str]:

@@ -186,9 +186,14 @@ def field_of(claim: Claim, x: list[Taylor], values: Mapping[tuple[int, ...], tup
     `values` has for every wave k an angle near k.q, and its sine and cosine with the bound of their errors.
     """
     space = x[0].space
-    waves = {k: sine_and_cosine(angle_of(k, x), center, known, place) for k, (center, known) in values.items()}
+    waves = waves_of(x, values, place)
     d, a, b = claim.equations.field(claim.numbers(space), x, waves)
     return Field(space.enclose(d), [space.enclose(each) for each in a], [space.enclose(each) for each in b], x, waves)
+
+
+def waves_of(x: list[Taylor], values: Mapping[tuple[int, ...], tuple[Any, tuple]], place: str) -> dict:
+    """Sine and cosine of k.q by k, at the states x; `values` as `field_of` has them."""
+    return {k: sine_and_cosine(angle_of(k, x), center, known, place) for k, (center, known) in values.items()}
 
 
 def field_around(claim: Claim, space: Any, center: Iterable, axes: list, place: str) -> tuple[list, Field]:
@@ -196,7 +201,7 @@ def field_around(claim: Claim, space: Any, center: Iterable, axes: list, place: 
     y = [space.y(i) for i in range(claim.n)]
     error = [dot(row, y) for row in axes]
     x = [Taylor(space, c + e).tidy() for c, e in zip(center, error, strict=True)]
-    return error, field_of(claim, x, waves_near(claim, x, place), place)
+    return error, field_of(claim, x, waves_near(claim.equations.waves, x, place), place)
 
 
 def angle_of(k: tuple[int, ...], x: list) -> Any:
@@ -204,10 +209,10 @@ def angle_of(k: tuple[int, ...], x: list) -> Any:
     return dot([x[i] for i, a in enumerate(k) if a], [Q(a) for a in k if a])
 
 
-def waves_near(claim: Claim, x: list[Taylor], place: str) -> dict[tuple[int, ...], tuple[Any, tuple]]:
-    """For `field_of`, about the middle of the states x."""
+def waves_near(waves: Iterable[tuple[int, ...]], x: list[Taylor], place: str) -> dict:
+    """The values of these waves for `field_of`, about the middle of the states x."""
     values = {}
-    for k in claim.equations.waves:
+    for k in waves:
         center, _ = near(angle_of(k, x).constant, 20)
         require(abs(center) <= 64, place, "the nominal angle is beyond 64 rad")
         sine, cosine = alternating(center, 1), alternating(center, 0)

@@ -21,7 +21,7 @@ def push_clearance(claim: Claim, interval: Interval, place: str) -> Callable[[An
     """An impulse -> the polynomial in s and the robots that must be positive."""
     data, space = motion(claim, interval), interval.space(claim)
     x = [Taylor(space, center).tidy() for center in data.center]
-    field = field_of(claim, x, waves_near(claim, x, place), place)
+    field = field_of(claim, x, waves_near(claim.equations.waves, x, place), place)
     adjugate, determinant = cofactors(data.axes)
     moved = [dot([Taylor(space, entry) for entry in row], field.b) for row in adjugate]
     room = field.d * Taylor(space, determinant)

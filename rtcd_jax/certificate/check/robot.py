@@ -79,7 +79,7 @@ class Equations(NamedTuple):
         q, v = x[: len(joints)], x[len(joints) :]
 
         def value(function: Function) -> Any:
-            return _value(robot, function, numbers, q, waves)
+            return value_of(robot, function, numbers, q, waves)
 
         lower = [[value(entry) for entry in row] for row in robot.mass]
         mass = [[lower[max(i, j)][min(i, j)] for j in joints] for i in joints]
@@ -138,7 +138,8 @@ def _merged(terms: Sequence[Term]) -> Function:
     return tuple(Term(joints, powers, a, b) for (joints, powers), (a, b) in total.items() if a != 0 or b != 0)
 
 
-def _value(robot: Robot, function: Function, numbers: Mapping[str, Any], q: Sequence, waves: Mapping) -> Any:
+def value_of(robot: Robot, function: Function, numbers: Mapping[str, Any], q: Sequence, waves: Mapping) -> Any:
+    """The function at the positions q; `waves` has the sine and the cosine of k.q by k."""
     total = 0
     for term in function:
         factor = _product((numbers[name], power) for name, power in term.powers)

@@ -5,6 +5,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from rtcd_jax.certificate.check.catch import catch_obligations
 from rtcd_jax.certificate.check.claim import Claim
 from rtcd_jax.certificate.check.exact import Damaged, Q, Undecided, printable, require, root_up, rounded
 from rtcd_jax.certificate.check.file import (
@@ -13,6 +14,7 @@ from rtcd_jax.certificate.check.file import (
     digest,
     parse,
     read_bytes,
+    read_catch,
     read_claim,
     read_goal,
     read_interval,
@@ -41,13 +43,15 @@ VERSIONS = 1, 2
 class Report(NamedTuple):
     """What an accepted certificate proves, rounded: volumes in the product of the states' units, times in s.
 
-    `digest` is the SHA-256 of the claim's canonical JSON.
+    `digest` is the SHA-256 of the claim's canonical JSON, `inlet` has the first ellipsoid's axes, exact. `shells` are
+    None, and `rest` is empty, where the motion ends in a catch.
     """
 
     claim: Claim
     digest: str
+    inlet: list
     intervals: int
-    shells: int
+    shells: int | None
     start: float
     end: float
     volumes: dict[str, float]
@@ -114,6 +118,13 @@ def check_goal(claim: Claim, node: Node, outlet: list) -> tuple[Goal, list, Any]
     return goal, [rest * root_up(dot(row, row)) for row in goal.axes], least
 
 
+def check_catch(claim: Claim, node: Node, outlet: list) -> Any:
+    """The margin of the motion's end in its catch."""
+    order, cases = read_catch(node, claim)
+    todo = catch_obligations(claim, outlet, order, node.place)
+    return min(margins(todo, cases, f"{node.place}.cases").values())
+
+
 def check(content: Any, progress: Callable[[int, int], None] = lambda done, of: None) -> Report:
     """What the parsed certificate proves.
 
@@ -135,28 +146,39 @@ def _check(content: Any, progress: Callable[[int, int], None]) -> Report:
     top.require(content.get("format") == FORMAT, f"is no {FORMAT!r}")
     version = content.get("version")
     top.require(type(version) is int and version in VERSIONS, "must be of version 1 or 2")
-    _, _, about, funnel, goal, notes = top.keys("format", "version", "claim", "funnel", "goal", "notes")
+    ends = "catch" if "catch" in content else "goal"
+    _, _, about, funnel, end, notes = top.keys("format", "version", "claim", "funnel", ends, "notes")
     texts, claim = read_notes(notes), read_claim(about)
     top.require(("plant" in about.value) == (version == 1), f"has the claim of another version than {version}")
+    held = claim.catch is None
+    top.require(held == (ends == "goal"), f"must have a {'goal' if held else 'catch'}, as its claim has")
     intervals = [read_interval(item, claim) for item in funnel.items(at_least=1)]
     check_chain(claim, intervals, funnel.place)
-    region, rest, least = check_goal(claim, goal, intervals[-1].last)
+    outlet, shells, rest = intervals[-1].last, None, []
+    if claim.catch is not None:
+        region, least = claim.catch.axes, check_catch(claim, end, outlet)
+    else:
+        goal, rest, least = check_goal(claim, end, outlet)
+        region, shells = goal.axes, len(goal.shells)
     for i, interval in enumerate(intervals):
         least = min(least, check_interval(claim, interval, f"{funnel.place}[{i}]"))
         progress(i + 1, len(intervals))
     top.require_digests()
-    volumes, axes = volumes_of(claim, intervals, region.axes)
+    volumes, axes = volumes_of(claim, intervals, region)
     begin = rounded((claim.start[0] + claim.start[1]) * claim.dt)
     return Report(
-        claim, digest(about.value), len(intervals), len(region.shells), begin, rounded(len(claim.u) * claim.dt),
-        volumes, axes, [rounded(r) for r in rest], rounded(least), texts,
+        claim, digest(about.value), intervals[0].first, len(intervals), shells, begin,
+        rounded(len(claim.u) * claim.dt), volumes, axes, [rounded(r) for r in rest], rounded(least), texts,
     )  # fmt: skip
 
 
 def volumes_of(
-    claim: Claim, intervals: Sequence[Interval], l_goal: list
+    claim: Claim, intervals: Sequence[Interval], region: list
 ) -> tuple[dict[str, float], dict[str, list[float]]]:
-    """Volumes |unit ball| det L, and half widths of the ellipsoids along each state."""
+    """Volumes |unit ball| det L, and half widths of the ellipsoids along each state; `region` has the axes of the goal
+    region, or of the catch set.
+    """
+    last = "goal" if claim.catch is None else "catch"
     ball = math.pi ** (claim.n / 2) / math.gamma(claim.n / 2 + 1)
 
     def volume(axes) -> float:
@@ -173,9 +195,9 @@ def volumes_of(
         integral += sum((c / (k + 1) for k, c in powers.items() if k % 2 == 0), Q(0)) * data.duration
     volumes = {
         "sum": total(knots), "integral": ball * rounded(integral), "inlet": volume(intervals[0].first),
-        "outlet": knots[-1], "goal": volume(l_goal),
+        "outlet": knots[-1], last: volume(region),
     }  # fmt: skip
-    return volumes, {"inlet": widths(intervals[0].first), "outlet": widths(intervals[-1].last), "goal": widths(l_goal)}
+    return volumes, {"inlet": widths(intervals[0].first), "outlet": widths(intervals[-1].last), last: widths(region)}
 
 
 def total(values: Sequence[float]) -> float:
@@ -207,11 +229,6 @@ def sentence(report: Report) -> str:
     limit = (
         f"{largest} {robot.input_unit}" if least == largest else f"a limit in [{least}, {largest}] {robot.input_unit}"
     )
-    comes = (
-        f"comes and stays within {_widths(report)} of the goal"
-        if claim.moves_the_goal
-        else f"converges to within {max(report.rest):.1g} of the goal in every state"
-    )
     on = "at the center of its robot's funnel" if claim.shifts else "on the nominal motion"
     push = (
         f" A state {on} that an impulse of up to {float(claim.push):.6g} {robot.input_unit} s on the "
@@ -220,17 +237,34 @@ def sentence(report: Report) -> str:
         else ""
     )
     funnel = "the funnel of its robot, all of one size, each about its own center," if claim.shifts else "the funnel"
+    last, region, levels = "goal", "goal region", f" and {report.shells} of level"
+    if claim.catch is not None:
+        last, region, levels = "catch", "catch set", ""
     return (
         f"PROVED in continuous time, by exact arithmetic, for {_robots(claim)} under the claimed controller, whose "
         f"input never exceeds {limit}{_acts(claim)}: every motion that is in {funnel} at some time of "
-        f"[{report.start:.6g} s, {report.end:.6g} s] stays in it, is in the goal region at {report.end:.6g} s, never "
-        f"leaves that region, and "
-        f"{comes}; {bounds or 'there is no limit on a state'} all the while.{push} Half widths: {extent('inlet')}; "
-        f"{extent('outlet')}; {extent('goal')}. Volumes (proved) [{unit}]: inlet {v['inlet']:.6g}, sum over the knots "
-        f"{v['sum']:.6g}, integral over time {v['integral']:.6g} s, goal region {v['goal']:.6g}. {report.intervals} "
-        f"intervals of time and {report.shells} of level, smallest margin {report.margin:.2g}. It is a statement about "
+        f"[{report.start:.6g} s, {report.end:.6g} s] stays in it{_end(report)}; "
+        f"{bounds or 'there is no limit on a state'} all the while.{push} Half widths: {extent('inlet')}; "
+        f"{extent('outlet')}; {extent(last)}. Volumes (proved) [{unit}]: inlet {v['inlet']:.6g}, sum over the knots "
+        f"{v['sum']:.6g}, integral over time {v['integral']:.6g} s, {region} {v[last]:.6g}. {report.intervals} "
+        f"intervals of time{levels}, smallest margin {report.margin:.2g}. It is a statement about "
         f"{_reservation(claim)}, not about hardware. Claim: sha256 {report.digest}."
     )
+
+
+def _end(report: Report) -> str:
+    """What becomes of a motion at t_N and later."""
+    claim, end = report.claim, f"{report.end:.6g} s"
+    if claim.catch is not None:
+        if claim.catch.reset is None:
+            return f" until {end}, where it is in the catch set"
+        return f" until {end}, where the claimed reset leads it into the catch set"
+    comes = (
+        f"comes and stays within {_widths(report)} of the goal"
+        if claim.moves_the_goal
+        else f"converges to within {max(report.rest):.1g} of the goal in every state"
+    )
+    return f", is in the goal region at {end}, never leaves that region, and {comes}"
 
 
 def _outside(each: HalfSpace | Ellipsoid, states: Sequence[str]) -> str:

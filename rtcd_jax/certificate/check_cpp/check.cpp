@@ -3,7 +3,7 @@
 // in the same place: where both accept a file, a mistake in either of them, in Python, in python-flint or in GMP alone
 // makes no false statement.
 //
-//     g++ -O1 -std=c++17 check.cpp -lgmpxx -lgmp -o check && ./check FILE [--seconds N]
+//     g++ -O1 -std=c++17 check.cpp -lgmpxx -lgmp -o check && ./check FILE [--seconds N]    or    ./check --cycle FILE FILE
 //
 // Exit code 0 if all of a file holds, 1 if it is refused, 2 if it is undecided or there is nothing to read.
 //
@@ -15,7 +15,7 @@
 // and nothing leaves the funnel if q > 0 for every input u + w that can act. The file proves it by sums of squares.
 //
 // Sections: verdicts, SHA-256, JSON, polynomials, enclosures, robots, positivity, sums of squares, the claim, inputs,
-// old measurements, the funnel, the goal, the file's parts, the sentence.
+// old measurements, the funnel, the goal, the catch, the file's parts, the verdict, the sentence, the command.
 
 #include <algorithm>
 #include <cmath>
@@ -1106,40 +1106,54 @@ struct Field {  // D x' = a + b (u + w)
   vector<T> a, b;
 };
 
-// At the states x, with sine and cosine of k.q by k. `exact` has the numbers that are known, `uncertain` the others.
+// A function at the positions x, with sine and cosine of k.q by k. `exact` has the numbers that are known, `uncertain`
+// the others.
+template <class T>
+T evaluated(const Robot& robot, const Function& f, const std::map<string, Q>& exact, const std::map<string, T>& uncertain,
+            const vector<T>& x, const std::map<Joints, std::pair<T, T>>& waves, const T& one) {
+  T total = one * Q(0);
+  for (auto& [joints, powers, cosine, sine] : f) {
+    Joints k = robot.wave(joints);
+    T part = one * cosine;
+    if (auto found = waves.find(k); found != waves.end())
+      part = cosine == 0 ? found->second.first * sine
+             : sine == 0 ? found->second.second * cosine
+                         : found->second.second * cosine + found->second.first * sine;
+    Q factor = 1;
+    std::optional<T> among;  // the uncertain ones' product
+    for (auto& [name, e] : powers)
+      for (int i = 0; i < e; i++) {
+        if (auto given = exact.find(name); given != exact.end()) factor *= given->second;
+        else among = among ? *among * uncertain.at(name) : uncertain.at(name);
+      }
+    part = among ? part * (*among * factor) : part * factor;
+    for (size_t i = 0; i < robot.joints(); i++)
+      if (!robot.hinge[i])
+        for (int e = 0; e < joints[i]; e++) part = part * x[i];
+    total = total + part;
+  }
+  return total;
+}
+
+// The whole matrix of which `lower` has the triangle.
+template <class T, class F>
+vector<vector<T>> symmetric(const vector<vector<Function>>& lower, F value) {
+  size_t n = lower.size();
+  vector<vector<T>> full(n);
+  for (size_t i = 0; i < n; i++)
+    for (size_t j = 0; j < n; j++) full[i].push_back(j <= i ? value(lower[i][j]) : full[0][0]);
+  for (size_t i = 0; i < n; i++)
+    for (size_t j = i + 1; j < n; j++) full[i][j] = full[j][i];
+  return full;
+}
+
+// At the states x.
 template <class T>
 Field<T> field(const Robot& robot, const std::map<string, Q>& exact, const std::map<string, T>& uncertain,
                const vector<T>& x, const std::map<Joints, std::pair<T, T>>& waves, const T& one) {
   size_t n = robot.joints();
-  auto value = [&](const Function& f) {
-    T total = one * Q(0);
-    for (auto& [joints, powers, cosine, sine] : f) {
-      Joints k = robot.wave(joints);
-      T part = one * cosine;
-      if (auto found = waves.find(k); found != waves.end())
-        part = cosine == 0 ? found->second.first * sine
-               : sine == 0 ? found->second.second * cosine
-                           : found->second.second * cosine + found->second.first * sine;
-      Q factor = 1;
-      std::optional<T> among;  // the uncertain ones' product
-      for (auto& [name, e] : powers)
-        for (int i = 0; i < e; i++) {
-          if (auto given = exact.find(name); given != exact.end()) factor *= given->second;
-          else among = among ? *among * uncertain.at(name) : uncertain.at(name);
-        }
-      part = among ? part * (*among * factor) : part * factor;
-      for (size_t i = 0; i < n; i++)
-        if (!robot.hinge[i])
-          for (int e = 0; e < joints[i]; e++) part = part * x[i];
-      total = total + part;
-    }
-    return total;
-  };
-  vector<vector<T>> mass(n);
-  for (size_t i = 0; i < n; i++)
-    for (size_t j = 0; j < n; j++) mass[i].push_back(j <= i ? value(robot.mass[i][j]) : one);
-  for (size_t i = 0; i < n; i++)
-    for (size_t j = i + 1; j < n; j++) mass[i][j] = mass[j][i];
+  auto value = [&](const Function& f) { return evaluated(robot, f, exact, uncertain, x, waves, one); };
+  vector<vector<T>> mass = symmetric<T>(robot.mass, value);
   vector<T> forces, motor;
   for (size_t i = 0; i < n; i++) {
     T force = value(robot.slopes[i]) * Q(-1) + value(robot.damping[i]) * x[n + i] * Q(-1);
@@ -1570,6 +1584,19 @@ struct Shift {
   vector<Matrix> rates;
 };
 
+// Where the motion ends: in {center + axes y : |y| <= 1}, or in what a reset leads into it: q+ = positions q + pi turns,
+// M+(q+) v+ = momentum(q) v, M+ of the same robot whose numbers are then these: other ones' values, or exact ones.
+struct Catch {
+  Row center;
+  Matrix axes;
+  bool resets = false;
+  vector<Joints> positions;
+  Joints turns;
+  std::map<string, string> renamed;
+  std::map<string, Q> exact;
+  vector<vector<Function>> momentum;
+};
+
 struct Claim {
   Robot robot;
   vector<std::pair<string, std::pair<Q, Q>>> parameters;  // in the file's order
@@ -1585,12 +1612,13 @@ struct Claim {
   vector<string> uncertain;
   vector<KeptOut> keep_out;
   vector<Shift> shifts;
+  std::optional<Catch> caught;  // x_goal and k_goal are empty then
 
   bool constant() const { return first_order || !shifts.empty(); }  // whether the numbers do not vary in time
   size_t ellipsoids() const {
     return size_t(std::count_if(keep_out.begin(), keep_out.end(), [](const KeptOut& each) { return !each.half; }));
   }
-  size_t n() const { return x_goal.size(); }
+  size_t n() const { return robot.states.size(); }
   bool moves_the_goal() const {
     return disturbance != 0 || age != 0 || std::any_of(noise.begin(), noise.end(), [](const Q& e) { return e != 0; });
   }
@@ -1676,9 +1704,9 @@ struct Here {
   }
 };
 
-Waves waves_near(const Claim& claim, const vector<Model>& x, const string& place) {
+Waves waves_near(const vector<Joints>& waves, const vector<Model>& x, const string& place) {
   Waves near;
-  for (auto& k : claim.robot.waves) {
+  for (auto& k : waves) {
     bool exact;
     Q center(nearest(exactly(angle_of(k, x).constant()), exact, 20), 1 << 20);
     center.canonicalize();
@@ -2088,7 +2116,7 @@ vector<Model> tidied(const vector<Model>& models) {
 void require_push(const Claim& claim, const Interval& piece, const Motion& on, const string& place) {
   Space space = space_of(claim, piece);
   vector<Model> x = tidied(with_shifts(space, on, models(space, on.state)));
-  Here here(claim, space, x, waves_near(claim, x, place), place);
+  Here here(claim, space, x, waves_near(claim.robot.waves, x, place), place);
   auto [adjugate, determinant] = cofactors(on.axes, Curve{1});
   Model room = here.f.d * model(space, determinant), needed(space);
   for (auto& row : adjugate) {
@@ -2127,7 +2155,7 @@ void require_jump(const Claim& claim, const Interval& piece, const string& place
     center.push_back({claim.x[k][i]});
   }
   vector<Model> error = tidied(with_shifts(space, here_on, errors_of(space, axes))), x = states_of(space, center, error);
-  Here here(claim, space, x, waves_near(claim, x, place), place);
+  Here here(claim, space, x, waves_near(claim.robot.waves, x, place), place);
   Q scale = scale_of(here.f.d), step = claim.u[k] - claim.u[k - 1];
   Model d = here.f.d * scale, moved(space), turned(space);
   for (size_t i = 0; i < n; i++) {
@@ -2170,7 +2198,7 @@ Named<Obligation> funnel_obligations(const Claim& claim, const Interval& piece, 
   auto [adjugate, determinant] = cofactors(on.axes, Curve{1});
   require(is_positive(determinant), place, "an ellipsoid is degenerate: det L must be > 0");
   vector<Model> error = with_shifts(space, on, errors_of(space, on.axes)), x = states_of(space, on.state, error);
-  Here here(claim, space, x, waves_near(claim, x, place), place);
+  Here here(claim, space, x, waves_near(claim.robot.waves, x, place), place);
   const Field<Model>& f = here.f;
   vector<Model> gain = models(space, on.gain);
   if (claim.age != 0) {
@@ -2403,6 +2431,87 @@ void require_arrival(const Claim& claim, const Matrix& outlet, const Goal& goal,
   require(is_positive_definite(form), place, "the funnel's outlet is not shown to lie in the goal region");
 }
 
+// The catch ------------------------------------------------------------------------------------------------------------
+
+// All k but zero of some functions.
+vector<Joints> waves_of(const Robot& robot, const vector<vector<Function>>& functions) {
+  std::set<Joints> all;
+  for (auto& row : functions)
+    for (auto& f : row)
+      for (auto& term : f) all.insert(robot.wave(std::get<0>(term)));
+  all.erase(Joints(robot.joints(), 0));
+  return {all.begin(), all.end()};
+}
+
+std::map<Joints, std::pair<Model, Model>> turned(const vector<Joints>& waves, const vector<Model>& x, const string& place) {
+  std::map<Joints, std::pair<Model, Model>> out;
+  for (auto& [k, value] : waves_near(waves, x, place)) out.emplace(k, sine_and_cosine(angle_of(k, x), value, place));
+  return out;
+}
+
+// D and D x+ of the states x, D the determinant of the mass matrix after the reset.
+std::pair<Model, vector<Model>> after_reset(const Claim& claim, const vector<Model>& x, const string& place) {
+  const Space& space = *x[0].space;
+  const Catch& reset = *claim.caught;
+  const Robot& robot = claim.robot;
+  size_t n = robot.joints();
+  Model one = model(space, Q(1));
+  vector<Model> q(x.begin(), x.begin() + long(n)), v(x.begin() + long(n), x.end()), after;
+  for (size_t i = 0; i < n; i++) {
+    Model at = model(space, Q(PI * reset.turns[i]));
+    at.d += up(PI_ERROR * std::abs(reset.turns[i]));
+    for (size_t j = 0; j < n; j++) at = at + q[j] * Q(reset.positions[i][j]);
+    after.push_back(at);
+  }
+  std::map<string, Q> known = claim.exact(), known_after = reset.exact;
+  std::map<string, Model> open = claim.between(space), open_after;
+  for (auto& [name, other] : reset.renamed) {
+    if (known.count(other)) known_after[name] = known.at(other);
+    else open_after.emplace(name, open.at(other));
+  }
+  auto before = turned(waves_of(robot, reset.momentum), q, place), then = turned(waves_of(robot, robot.mass), after, place);
+  vector<Model> momenta;
+  for (auto& row : reset.momentum) {
+    momenta.emplace_back(space);
+    for (size_t j = 0; j < n; j++) momenta.back() = momenta.back() + evaluated(robot, row[j], known, open, q, before, one) * v[j];
+  }
+  auto mass = symmetric<Model>(robot.mass, [&](const Function& f) { return evaluated(robot, f, known_after, open_after, after, then, one); });
+  auto [adjugate, determinant] = cofactors(mass, one);
+  vector<Model> out;
+  for (auto& at : after) out.push_back(determinant * at);
+  for (auto& row : adjugate) out.push_back(dot(row, momenta));
+  return {determinant, out};
+}
+
+// |adj(L_c) D (x+ - c)| < D det L_c at all states c_p(t_N) + l L_N z, l in [0, 1], |z| = 1; without a reset x+ = x, D = 1.
+Named<Obligation> catch_obligations(const Claim& claim, const Matrix& outlet, int order, const string& place) {
+  Space space = claim.space(MAX_ORDER, order);
+  vector<Model> x;
+  for (size_t i = 0; i < claim.n(); i++) {
+    vector<Curve> row;
+    for (auto& q : outlet[i]) row.push_back({q});
+    Model at = model(space, claim.x.back()[i]) + form(space, row, 1);
+    for (auto& shift : claim.shifts) at = at + model(space, std::map<Key, Q>{{space.robot(shift.powers), shift.x.back()[i]}});
+    x.push_back(at.tidy());
+  }
+  const Catch& set = *claim.caught;
+  auto [adjugate, determinant] = cofactors(set.axes, Q(1));
+  require(determinant > 0, place, "the catch set is degenerate: det L must be > 0");
+  auto [factor, landed] = set.resets ? after_reset(claim, x, place) : std::make_pair(model(space, Q(1)), x);
+  Q scale = positive_scale(exactly(factor.constant()), determinant, place) / 2;
+  vector<Model> offset;
+  for (size_t i = 0; i < claim.n(); i++) offset.push_back((landed[i] - factor * set.center[i]) * scale);
+  Model room = factor * Q(determinant * scale), q = room * room;
+  for (auto& row : adjugate) {
+    Model apart(space);
+    for (size_t i = 0; i < claim.n(); i++) apart = apart + offset[i] * row[i];
+    q = q - apart * apart;
+  }
+  Named<Obligation> todo;
+  for_all_robots(todo, claim, "caught", Obligation{{}, exactly(q.r + q.d), 0, {}, 0, 1}, q);
+  return todo;
+}
+
 // The file's parts -----------------------------------------------------------------------------------------------------
 
 Function read_function(const Node& node, const vector<bool>& hinge) {
@@ -2480,7 +2589,7 @@ Robot cartpole() {
   return robot;
 }
 
-const vector<string> LOOP{"state_limits", "dt", "x", "rates", "u", "K", "x_goal", "K_goal", "start"};
+const vector<string> LOOP{"state_limits", "dt", "x", "rates", "u", "K", "start"}, AT_GOAL{"x_goal", "K_goal"};
 
 void read_loop(const Node& node, Claim& claim) {
   long n = long(claim.robot.states.size());
@@ -2493,13 +2602,14 @@ void read_loop(const Node& node, Claim& claim) {
   for (auto& pair : node.at("rates").items(knots - 1)) claim.rates.push_back(pair.matrix(2, n));
   claim.u = node.at("u").row(knots - 1);
   claim.k = node.at("K").matrix(knots, n);
-  claim.x_goal = node.at("x_goal").row(n), claim.k_goal = node.at("K_goal").row(n);
+  if (!claim.caught) claim.x_goal = node.at("x_goal").row(n), claim.k_goal = node.at("K_goal").row(n);
   auto start = node.at("start").items(2);
   claim.first_knot = start[0].integer(0, knots - 1), claim.start = start[1].number();
 }
 
 Claim read_claim_1(const Node& node) {
   vector<string> names = LOOP;
+  names.insert(names.end(), AT_GOAL.begin(), AT_GOAL.end());
   names.insert(names.begin(), {"plant", "parameters"});
   node.keys(names);
   node.digests();
@@ -2585,10 +2695,51 @@ vector<Shift> read_shifts(const Node& node, const Claim& claim, long knots) {
   return shifts;
 }
 
+Catch read_catch(const Node& node, const Claim& claim) {
+  long n = long(claim.robot.states.size()), joints = long(claim.robot.joints());
+  Catch set;
+  set.resets = node.has("reset");
+  node.keys(set.resets ? vector<string>{"center", "axes", "reset"} : vector<string>{"center", "axes"});
+  node.digests();
+  set.center = node.at("center").row(n), set.axes = node.at("axes").matrix(n, n);
+  if (!set.resets) return set;
+  Node reset = node.at("reset");
+  for (bool hinge : claim.robot.hinge) reset.require(hinge, "needs a robot whose joints are all hinges");
+  reset.keys({"positions", "turns", "numbers", "momentum"});
+  reset.digests();
+  auto integers = [&](const Node& each) {
+    Joints out;
+    for (auto& k : each.items(joints)) out.push_back(int(k.integer(-HIGHEST, HIGHEST)));
+    return out;
+  };
+  for (auto& row : reset.at("positions").items(joints)) set.positions.push_back(integers(row));
+  set.turns = integers(reset.at("turns"));
+  vector<string> every;
+  for (auto& each : claim.box) every.push_back(each.first);
+  std::set<string> given;
+  for (auto& [name, value] : reset.at("numbers").named()) {
+    given.insert(name);
+    if (value.is(Value::TEXT) && claim.box.count(value.value->text)) set.renamed[name] = value.value->text;
+    else set.exact[name] = value.number();
+  }
+  reset.at("numbers").require(given == std::set<string>(every.begin(), every.end()), "must be the robot's, " + joined(every));
+  for (auto& row : reset.at("momentum").items(joints)) {
+    set.momentum.emplace_back();
+    for (auto& entry : row.items(joints)) set.momentum.back().push_back(read_function(entry, claim.robot.hinge));
+    for (auto& f : set.momentum.back())
+      for (auto& term : f)
+        for (auto& power : std::get<1>(term))
+          reset.at("momentum").require(claim.box.count(power.first), "must be of the robot's numbers, " + joined(every));
+  }
+  return set;
+}
+
 Claim read_claim_2(const Node& node) {
   vector<string> names{"robot", "parameters", "limit", "disturbance", "noise", "age", "speed"};
   names.insert(names.end(), LOOP.begin(), LOOP.end());
   names.push_back("push");
+  if (node.has("catch")) names.push_back("catch");
+  else names.insert(names.end(), AT_GOAL.begin(), AT_GOAL.end());
   Claim claim;
   claim.first_order = node.has("jerk");
   if (claim.first_order) names.insert(names.end(), {"jerk", "reaction", "jumps"});
@@ -2622,20 +2773,23 @@ Claim read_claim_2(const Node& node) {
   if (node.has("keep_out"))
     for (auto& each : node.at("keep_out").items(-1, 1)) claim.keep_out.push_back(read_set(each, long(claim.robot.states.size())));
   if (node.has("shifts")) claim.shifts = read_shifts(node.at("shifts"), claim, long(node.at("x").items().size()));
+  if (node.has("catch")) claim.caught = read_catch(node.at("catch"), claim);
   read_loop(node, claim);
   return claim;
 }
 
-bool is_case(const string& name) {  // (free|high|low)[-+]?(late)?(/n(,n)*)?
+bool is_case(const string& name) {  // ((free|high|low)[-+]?(late)?|caught)(/n(,n)*)?
   size_t i = 0;
   auto next = [&](const string& word) {
     bool there = name.compare(i, word.size(), word) == 0;
     if (there) i += word.size();
     return there;
   };
-  if (!next("free") && !next("high") && !next("low")) return false;
-  if (!next("-")) next("+");
-  next("late");
+  if (!next("caught")) {
+    if (!next("free") && !next("high") && !next("low")) return false;
+    if (!next("-")) next("+");
+    next("late");
+  }
   if (i == name.size()) return true;
   if (!next("/")) return false;
   for (;;) {
@@ -2791,7 +2945,8 @@ struct Report {
   Claim claim;
   string digest;
   size_t intervals, shells;
-  double start, end, margin, inlet, sum, integral, goal;
+  double start, end, margin, inlet, sum, integral, last;  // volumes; `last` of the goal region or the catch set
+  Matrix first;                                           // the axes of the inlet
   std::map<string, vector<double>> widths;
   vector<double> rest;
   vector<std::pair<string, string>> notes;
@@ -2801,6 +2956,64 @@ vector<double> widths_of(const Matrix& axes, const Q& times = 1) {
   vector<double> out;
   for (auto& row : axes) out.push_back(rounded(times * exactly(root_up(dot(row, row)))));
   return out;
+}
+
+// The region in which a motion ends, or is caught; how close to the goal it comes, by state; the least margin.
+struct Ended {
+  Matrix region;
+  size_t shells = 0;
+  vector<double> rest;
+  Q least;
+};
+
+Ended check_goal(const Claim& claim, const Node& node, const Matrix& outlet) {
+  int n = int(claim.n());
+  Goal goal = read_goal(node, claim);
+  for (int i = 0; i < n; i++) {
+    if (!claim.bounds[size_t(i)]) continue;
+    Q left = *claim.bounds[size_t(i)] - abs(claim.x_goal[size_t(i)]);
+    const Row& row = goal.axes[size_t(i)];
+    require(left > 0 && left * left > dot(row, row), node.place + ".axes", "the limit on |" + printable(claim.robot.states[size_t(i)]) + "| is not kept");
+  }
+  size_t ellipsoid = 0;
+  for (size_t j = 0; j < claim.keep_out.size(); j++) {
+    const KeptOut& each = claim.keep_out[j];
+    const Row w = each.half ? each.normal : goal.sides[ellipsoid++][0];
+    Q left = each.half ? each.offset : Q(-each.support(w)), square = 0;
+    for (size_t i = 0; i < size_t(n); i++) left += w[i] * ((each.half ? Q(0) : each.center[i]) - claim.x_goal[i]);
+    for (size_t column = 0; column < size_t(n); column++) {
+      Q turned = 0;
+      for (size_t i = 0; i < size_t(n); i++) turned += w[i] * goal.axes[i][column];
+      square += turned * turned;
+    }
+    require(left > 0 && left * left > square, node.place + ".axes", "the set claim.keep_out[" + std::to_string(j) + "] is not kept out of");
+  }
+  GoalField field;
+  goal_field(claim, goal, node.place, field);
+  for (auto& center : last_centers(claim)) require_arrival(claim, outlet, goal, center, node.place + ".axes");
+  std::optional<Q> least;
+  Q drift = 0;
+  for (size_t i = 0; i < goal.shells.size(); i++) {
+    const Shell& shell = goal.shells[i];
+    auto todo = goal_obligations(claim, field, shell.start, shell.end, are_joined(shell.names));
+    Q found = margins(todo, shell.cases, shell.names, n, node.place + ".shells[" + std::to_string(i) + "].cases");
+    least = least ? std::min(*least, found) : found;
+    for (auto& [name, one] : todo) drift = std::max(drift, one.drift);
+  }
+  Q rest = std::max(goal.rest, Q(drift / *least));
+  require(rest < 1, node.place, "the rounding of the goal is too large for a proof");
+  return {goal.axes, goal.shells.size(), widths_of(goal.axes, rest), *least};
+}
+
+Ended check_catch(const Claim& claim, const Node& node, const Matrix& outlet) {
+  node.keys({"order", "cases"});
+  node.digests();
+  int order = int(node.at("order").integer(2, MAX_ORDER - 2)), n = int(claim.n());
+  require_few_terms(node.at("order"), n, 0, order);  // each power of y has the same one of l
+  vector<string> names;
+  std::map<string, Gram> cases;
+  read_cases(node.at("cases"), n, names, cases);
+  return {claim.caught->axes, 0, {}, margins(catch_obligations(claim, outlet, order, node.place), cases, names, n, node.place + ".cases")};
 }
 
 Report check(const Value& content) {
@@ -2813,7 +3026,8 @@ Report check(const Value& content) {
   top.require(stated("format", Value::TEXT, "rtcd certificate"), "is no 'rtcd certificate'");
   bool first = stated("version", Value::INTEGER, "1");
   top.require(first || stated("version", Value::INTEGER, "2"), "must be of version 1 or 2");
-  top.keys({"format", "version", "claim", "funnel", "goal", "notes"});
+  bool caught = top.has("catch");
+  top.keys({"format", "version", "claim", "funnel", caught ? "catch" : "goal", "notes"});
   Report report;
   Node notes = top.at("notes");
   notes.require(notes.is(Value::OBJECT), "must be an object");
@@ -2830,44 +3044,13 @@ Report check(const Value& content) {
   top.require(names_its_robot == first, "has the claim of another version");
   vector<Interval> funnel;
   for (auto& item : top.at("funnel").items(-1, 1)) funnel.push_back(read_interval(item, claim));
-  string place = top.place + ".funnel", at_goal = top.place + ".goal";
+  string place = top.place + ".funnel";
   require_chain(claim, funnel, place);
 
   int n = int(claim.n());
-  Goal goal = read_goal(top.at("goal"), claim);
-  for (int i = 0; i < n; i++) {
-    if (!claim.bounds[size_t(i)]) continue;
-    Q left = *claim.bounds[size_t(i)] - abs(claim.x_goal[size_t(i)]);
-    const Row& row = goal.axes[size_t(i)];
-    require(left > 0 && left * left > dot(row, row), at_goal + ".axes", "the limit on |" + printable(claim.robot.states[size_t(i)]) + "| is not kept");
-  }
-  size_t ellipsoid = 0;
-  for (size_t j = 0; j < claim.keep_out.size(); j++) {
-    const KeptOut& each = claim.keep_out[j];
-    const Row w = each.half ? each.normal : goal.sides[ellipsoid++][0];
-    Q left = each.half ? each.offset : Q(-each.support(w)), square = 0;
-    for (size_t i = 0; i < size_t(n); i++) left += w[i] * ((each.half ? Q(0) : each.center[i]) - claim.x_goal[i]);
-    for (size_t column = 0; column < size_t(n); column++) {
-      Q turned = 0;
-      for (size_t i = 0; i < size_t(n); i++) turned += w[i] * goal.axes[i][column];
-      square += turned * turned;
-    }
-    require(left > 0 && left * left > square, at_goal + ".axes", "the set claim.keep_out[" + std::to_string(j) + "] is not kept out of");
-  }
-  GoalField field;
-  goal_field(claim, goal, at_goal, field);
-  for (auto& center : last_centers(claim)) require_arrival(claim, funnel.back().last, goal, center, at_goal + ".axes");
-  std::optional<Q> least;
-  Q drift = 0;
-  for (size_t i = 0; i < goal.shells.size(); i++) {
-    const Shell& shell = goal.shells[i];
-    auto todo = goal_obligations(claim, field, shell.start, shell.end, are_joined(shell.names));
-    Q found = margins(todo, shell.cases, shell.names, n, at_goal + ".shells[" + std::to_string(i) + "].cases");
-    least = least ? std::min(*least, found) : found;
-    for (auto& [name, one] : todo) drift = std::max(drift, one.drift);
-  }
-  Q rest = std::max(goal.rest, Q(drift / *least));
-  require(rest < 1, at_goal, "the rounding of the goal is too large for a proof");
+  top.require(claim.caught.has_value() == caught, string("must have a ") + (caught ? "goal" : "catch") + ", as its claim has");
+  Ended end = (caught ? check_catch : check_goal)(claim, top.at(caught ? "catch" : "goal"), funnel.back().last);
+  Q least = end.least;
 
   Q integral = 0;
   for (size_t i = 0; i < funnel.size(); i++) {
@@ -2878,7 +3061,7 @@ Report check(const Value& content) {
     if (claim.push != 0) require_push(claim, funnel[i], on, here);
     if (claim.first_order) require_jump(claim, funnel[i], here);
     auto todo = funnel_obligations(claim, funnel[i], on, here);
-    least = std::min(*least, margins(todo, funnel[i].cases, funnel[i].names, n, here + ".cases"));
+    least = std::min(least, margins(todo, funnel[i].cases, funnel[i].names, n, here + ".cases"));
     Curve determinant = cofactors(on.axes, Curve{1}).second;
     for (size_t k = 0; k < determinant.size(); k += 2) integral += determinant[k] / Q(long(k + 1)) * on.duration;
   }
@@ -2890,14 +3073,14 @@ Report check(const Value& content) {
   for (auto& piece : funnel)
     if (piece.start == 0) sum += volume(piece.first);
   report.digest = digest(*about.value);
-  report.intervals = funnel.size(), report.shells = goal.shells.size();
+  report.intervals = funnel.size(), report.shells = end.shells;
   report.start = rounded((claim.first_knot + claim.start) * claim.dt);
   report.end = rounded(Q(long(claim.u.size())) * claim.dt);
-  report.margin = rounded(*least);
-  report.inlet = volume(funnel[0].first), report.goal = volume(goal.axes);
+  report.margin = rounded(least);
+  report.inlet = volume(funnel[0].first), report.last = volume(end.region), report.first = funnel[0].first;
   report.sum = double(sum), report.integral = ball * rounded(integral);
-  report.widths = {{"inlet", widths_of(funnel[0].first)}, {"outlet", widths_of(funnel.back().last)}, {"goal", widths_of(goal.axes)}};
-  report.rest = widths_of(goal.axes, rest);
+  report.widths = {{"inlet", widths_of(funnel[0].first)}, {"outlet", widths_of(funnel.back().last)}, {caught ? "catch" : "goal", widths_of(end.region)}};
+  report.rest = end.rest;
   return report;
 }
 
@@ -2957,9 +3140,15 @@ string sentence(const Report& report) {
   if (claim.age != 0)
     acts += ", for feedback whose state was measured at most " + number(claim.age) +
             " s ago, under the controller in charge and not before the motion began";
-  comes = claim.moves_the_goal() ? "comes and stays within " + widths(report.rest) + " of the goal"
+  if (!claim.caught)
+    comes = claim.moves_the_goal() ? "comes and stays within " + widths(report.rest) + " of the goal"
                                  : "converges to within " + formatted("%.1g", *std::max_element(report.rest.begin(), report.rest.end())) +
                                        " of the goal in every state";
+  string ends = " s, never leaves that region, and " + comes;
+  if (claim.caught)
+    ends = string(" until ") + six(report.end) + " s, where " + (claim.caught->resets ? "the claimed reset leads it into" : "it is in") + " the catch set";
+  else
+    ends = ", is in the goal region at " + six(report.end) + ends;
   string times = "[" + six(report.start) + " s, " + six(report.end) + " s]";
   if (claim.push != 0)
     push = string(" A state ") + (claim.shifts.empty() ? "on the nominal motion" : "at the center of its robot's funnel") +
@@ -2967,16 +3156,52 @@ string sentence(const Report& report) {
   string funnel = claim.shifts.empty() ? "the funnel" : "the funnel of its robot, all of one size, each about its own center,";
   bool noisy = !errors.empty();
   string extents;
-  for (const char* place : {"inlet", "outlet", "goal"}) extents += (extents.empty() ? "" : "; ") + (place + (" " + widths(report.widths.at(place))));
+  const char* last = claim.caught ? "catch" : "goal";
+  for (const char* place : {"inlet", "outlet", last}) extents += (extents.empty() ? "" : "; ") + (place + (" " + widths(report.widths.at(place))));
   return "PROVED in continuous time, by exact arithmetic, for " + robots + " under the claimed controller, whose input never exceeds " +
-         limit + acts + ": every motion that is in " + funnel + " at some time of " + times + " stays in it, is in the goal region at " +
-         six(report.end) + " s, never leaves that region, and " + comes + "; " + (bounds.empty() ? "there is no limit on a state" : bounds) +
+         limit + acts + ": every motion that is in " + funnel + " at some time of " + times + " stays in it" + ends + "; " + (bounds.empty() ? "there is no limit on a state" : bounds) +
          " all the while." + push + " Half widths: " + extents + ". Volumes (proved) [" + unit + "]: inlet " + six(report.inlet) +
-         ", sum over the knots " + six(report.sum) + ", integral over time " + six(report.integral) + " s, goal region " + six(report.goal) +
-         ". " + std::to_string(report.intervals) + " intervals of time and " + std::to_string(report.shells) + " of level, smallest margin " +
+         ", sum over the knots " + six(report.sum) + ", integral over time " + six(report.integral) + " s, " +
+         (claim.caught ? "catch set " : "goal region ") + six(report.last) + ". " + std::to_string(report.intervals) + " intervals of time" +
+         (claim.caught ? "" : " and " + std::to_string(report.shells) + " of level") + ", smallest margin " +
          formatted("%.2g", report.margin) + ". It is a statement about " + (claim.uncertain.empty() ? "this model, its" : "these models, their") +
          " state " + (noisy ? "known up to these errors" : "known exactly") + " and " +
          (claim.age != 0 ? "its feed-forward in time" : "its input applied without sampling") + ", not about hardware. Claim: sha256 " + report.digest + ".";
+}
+
+// Cycles ---------------------------------------------------------------------------------------------------------------
+
+// That proved motions follow one another in this order, the first one after the last.
+void require_cycle(const vector<Report>& reports) {
+  for (size_t i = 0; i < reports.size(); i++) {
+    const Claim &claim = reports[i].claim, &ahead = reports[(i + 1) % reports.size()].claim;
+    string place = "certificate " + std::to_string(i + 1);
+    require(claim.caught && claim.caught->resets, place, "does not end in a reset");
+    const Catch& set = *claim.caught;
+    require(ahead.first_knot == 0 && ahead.start == 0, place, "is followed by one that is not proved from t = 0 on");
+    require(set.center == ahead.x[0] && set.axes == reports[(i + 1) % reports.size()].first, place,
+            "its catch set is not the first ellipsoid of the one that follows");
+    const Robot &a = claim.robot, &b = ahead.robot;
+    require(std::tie(a.name, a.input_unit, a.states, a.units, a.hinge, a.mass, a.potential, a.damping, a.motor) ==
+                std::tie(b.name, b.input_unit, b.states, b.units, b.hinge, b.mass, b.potential, b.damping, b.motor),
+            place, "is followed by one about another robot");
+    Box after;
+    for (auto& [name, value] : set.exact) after[name] = {value, value};
+    for (auto& [name, other] : set.renamed) after[name] = claim.box.at(other);
+    require(after == ahead.box, place, "the robot's numbers after its reset are not those of the one that follows");
+    require(claim.limits == ahead.limits, place, "is followed by one with another limit of the motor");
+  }
+}
+
+string cycle_sentence(const vector<Report>& reports) {
+  bool one = reports.size() == 1;
+  string digests;
+  for (auto& report : reports) digests += (digests.empty() ? "" : ", ") + report.digest;
+  return "PROVED that " + (one ? string("this motion is") : "these " + std::to_string(reports.size()) + " motions are") +
+         " a cycle: what the reset at the end makes of the last ellipsoid lies in " +
+         (one ? "its first one" : "the first one of the motion that follows, of the last in the first") +
+         ". A robot that is in a funnel at some time stays in the funnels for ever, motion after motion, if each reset comes at its "
+         "instant and is as claimed. Claims: sha256 " + digests + ".";
 }
 
 // The command ----------------------------------------------------------------------------------------------------------
@@ -3011,28 +3236,31 @@ Value content_of(const string& path) {
 }
 
 const char* USAGE =
-    "usage: check FILE [--seconds N]\n\n"
+    "usage: check FILE [--seconds N]\n       check --cycle FILE FILE [...] [--seconds N]\n\n"
     "Check a certificate by exact arithmetic. Exit code 0 only if all of it holds; 1 if it is refused, with the place and\n"
     "the reason; 2 if it is undecided or there is nothing to read.\n\n"
-    "  --seconds N  give up after so many seconds of wall clock [s] (> 0, default 600)\n";
+    "  --seconds N  give up after so many seconds of wall clock [s] (> 0, default 600)\n"
+    "  --cycle      also: does each motion end where the next one begins, the last where the first does?\n";
 
 int main(int count, char** words) {
-  string file, seconds = "600";
-  bool given = false;
+  string seconds = "600";
+  vector<string> files;
+  bool cycle = false;
   for (int i = 1; i < count; i++) {
     string word = words[i];
     if (word == "-h" || word == "--help") return std::printf("%s", USAGE), 0;
     if (word == "--seconds" && i + 1 < count) seconds = words[++i];
     else if (word.rfind("--seconds=", 0) == 0) seconds = word.substr(10);
-    else if (word.rfind("--", 0) == 0 || given) return std::fprintf(stderr, "check: %s: must be one file and --seconds N\n", printable(word).c_str()), 2;
-    else file = word, given = true;
+    else if (word == "--cycle") cycle = true;
+    else if (word.rfind("--", 0) == 0) return std::fprintf(stderr, "check: %s: must be files, --seconds N or --cycle\n", printable(word).c_str()), 2;
+    else files.push_back(word);
   }
   char* end = nullptr;
   double limit = std::strtod(seconds.c_str(), &end);
   if (seconds.empty() || *end || !(limit > 0 && limit <= 1e6))
     return std::fprintf(stderr, "check: --seconds %s: must be a number > 0 and <= 1e6\n", printable(seconds).c_str()), 2;
-  if (!given) return std::fprintf(stderr, "check: must have a file\n%s", USAGE), 2;
-  string name = printable(file);
+  if (files.empty() || (files.size() > 1 && !cycle)) return std::fprintf(stderr, "check: must have a file, or with --cycle some\n%s", USAGE), 2;
+  string name = printable(files[0]);
   gave_up = name + ": gave up after " + formatted("%g", limit) + " s: undecided; --seconds gives it more\n";
   std::signal(SIGALRM, [](int) { leave(gave_up); });
   itimerval timer{};
@@ -3053,10 +3281,18 @@ int main(int count, char** words) {
       },
       nullptr);
   try {
-    Report report = check(content_of(file));
-    std::printf("%s\n", sentence(report).c_str());
-    for (auto& [key, text] : report.notes)
-      std::printf("%s\n", printable("note of the file's author, not proved: " + key + ": " + text, LONGEST_NOTE).c_str());
+    vector<Report> reports;
+    for (auto& file : files) {
+      name = printable(file);
+      reports.push_back(check(content_of(file)));
+    }
+    if (cycle) require_cycle(reports);
+    for (auto& report : reports) {
+      std::printf("%s\n", sentence(report).c_str());
+      for (auto& [key, text] : report.notes)
+        std::printf("%s\n", printable("note of the file's author, not proved: " + key + ": " + text, LONGEST_NOTE).c_str());
+    }
+    if (cycle) std::printf("%s\n", cycle_sentence(reports).c_str());
     return 0;
   } catch (const Refused& refused) {
     std::fprintf(stderr, "REFUSED %s\n%s\n", name.c_str(), printable(refused.place + ": " + refused.reason).c_str());

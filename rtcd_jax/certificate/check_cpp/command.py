@@ -45,20 +45,24 @@ def main(arguments: Sequence[str]) -> int:
     sys.stderr.write(errors.getvalue())
     if code == 2:
         return code
-    # the first line of stdout is the sentence; the second one of stderr says why a file is refused
-    verdict = said.getvalue().partition("\n")[0] or errors.getvalue().splitlines()[1]
-    file, seconds, _ = first.options_of(words)
-    return code if _agrees(built(), file, seconds, verdict, proved=bool(said.getvalue())) else 1
+    files, seconds, _, cycle = first.options_of(words)
+    asked = [*files, "--seconds", repr(seconds), *(("--cycle",) if cycle else ())]
+    return code if _agrees(built(), asked, _proved(said.getvalue())) else 1
 
 
-def _agrees(program: Path, file: str, seconds: float, verdict: str, proved: bool) -> bool:
+def _proved(output: str) -> list[str]:
+    """The sentences of an output; none where a file is refused."""
+    return [exact(line) for line in output.splitlines() if line.startswith("PROVED ")]
+
+
+def _agrees(program: Path, asked: Sequence[str], proved: list[str]) -> bool:
     """Whether the second checker comes to the same; says so. Raises UserError where it does not decide."""
-    done = subprocess.run([program, file, "--seconds", repr(seconds)], capture_output=True, text=True)
+    done = subprocess.run([program, *asked], capture_output=True, text=True)
     if done.returncode not in (0, 1):
         reason = done.stderr.strip() or f"ended with {done.returncode}"
         raise UserError(f"the second checker does not decide: {printable(reason)}")
     theirs = (done.stdout.splitlines() or done.stderr.splitlines()[1:])[0]
-    if done.returncode == 0 and proved and exact(theirs) == exact(verdict):
+    if done.returncode == 0 and proved and _proved(done.stdout) == proved:
         print("The second checker, in C++, proves the same.")
         return True
     if done.returncode == 1 and not proved:

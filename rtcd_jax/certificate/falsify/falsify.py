@@ -176,12 +176,17 @@ def sentence(motions: Motions, summary: Summary) -> str:
     """The summary in plain words."""
     nearest = f"closest {summary.share_of_limit:.6f} of it" if summary.share_of_limit else "there is none"
     times = f", all that is uncertain {motions.beyond:g} times as large as certified" if motions.beyond != 1 else ""
+    catch = motions.claim.catch
+    end = (
+        f"{summary.moved_away} moved away from the goal in the goal region, {summary.not_arrived} did not arrive"
+        if catch is None
+        else f"{summary.not_arrived} {'were not led into' if catch.reset else 'did not end in'} the catch set"
+    )
     return (
         f"{summary.rollouts} simulated motions of the {motions.plant} from instants all over [{motions.start:.6g} s, "
         f"{motions.end:.6g} s], half of them from the funnel's boundary{times}: {summary.left_funnel} left the funnel "
         f"(largest |y| after the start {summary.level:.9f}), {summary.left_limits} exceeded a limit on the states "
-        f"({nearest}), {summary.moved_away} moved away from the goal in the goal region, "
-        f"{summary.not_arrived} did not arrive. Integrator: {summary.steps} classical Runge-Kutta steps an interval; "
+        f"({nearest}), {end}. Integrator: {summary.steps} classical Runge-Kutta steps an interval; "
         f"halved steps change |y| of every {REPEATED}th motion by {summary.error:.2g} at most; beyond 1 counts from "
         f"{summary.allowance:.2g} on."
     )

@@ -8,7 +8,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from rtcd_jax.certificate.check import HINGE, Claim, Robot
+from rtcd_jax.certificate.check import HINGE, Claim, Function, Reset, Robot
+from rtcd_jax.certificate.check.matrix import dot
 
 CORNERS = 0.5
 """Share of the robots that sit at a corner of the box; the others are uniform in it."""
@@ -60,28 +61,11 @@ def rate(
     """x' of every motion's own robot."""
     joints = len(robot.joints)
     q, v = x[:joints], x[joints:]
-    zero = np.zeros(x.shape[1])
 
-    def value(function, by: int | None = None):
-        """Of a function of the positions, or of its derivative by one of them."""
-        total = zero
-        for term in function:
-            factor = np.prod([drawn.numbers[name] ** power for name, power in term.powers], axis=0)
-            angle = sum((k * q[i] for i, k in enumerate(term.joints) if robot.joints[i] == HINGE), zero)
-            sine, cosine, a, b = np.sin(angle), np.cos(angle), float(term.cosine), float(term.sine)
-            turned, slides = a * cosine + b * sine, [
-                (i, e) for i, e in enumerate(term.joints) if robot.joints[i] != HINGE and e
-            ]  # fmt: skip
-            if by is not None and robot.joints[by] == HINGE:
-                turned = term.joints[by] * (b * cosine - a * sine)
-            for i, e in slides:
-                turned = turned * (q[i] ** e if i != by else e * q[i] ** (e - 1))
-            if by is not None and robot.joints[by] != HINGE and not term.joints[by]:
-                continue
-            total = total + factor * turned
-        return total
+    def value(function: Function, by: int | None = None) -> np.ndarray:
+        return _value(robot, function, drawn.numbers, q, by)
 
-    def entry(i: int, j: int, by: int | None = None):
+    def entry(i: int, j: int, by: int | None = None) -> np.ndarray:
         return value(robot.mass[max(i, j)][min(i, j)], by)
 
     every = range(joints)
@@ -94,7 +78,45 @@ def rate(
                 total = total - slope * v[j] * v[k]
         force.append(total)
     mass = [[entry(i, j) for j in every] for i in every]
-    if joints == 1:
-        return np.stack([v[0], force[0] / mass[0][0]])
-    solved = np.linalg.solve(np.moveaxis(np.array(mass), 2, 0), np.array(force).T[..., None])[..., 0].T
-    return np.concatenate([v, solved])
+    return np.concatenate([v, _solved(mass, force)])
+
+
+def after_reset(robot: Robot, reset: Reset, drawn: Drawn, x: Float[np.ndarray, "n M"]) -> Float[np.ndarray, "n M"]:
+    """What the reset makes of every motion's state."""
+    every = range(len(robot.joints))
+    q, v = x[: len(every)], x[len(every) :]
+    after = np.array(reset.positions) @ q + np.pi * np.array(reset.turns)[:, None]
+    numbers = {
+        name: drawn.numbers[a] if isinstance(a, str) else np.full(x.shape[1], float(a))
+        for name, a in reset.numbers.items()
+    }
+    mass = [[_value(robot, robot.mass[max(i, j)][min(i, j)], numbers, after) for j in every] for i in every]
+    momentum = [dot([_value(robot, entry, drawn.numbers, q) for entry in row], v) for row in reset.momentum]
+    return np.concatenate([after, _solved(mass, momentum)])
+
+
+def _value(robot: Robot, function: Function, numbers: dict, q: np.ndarray, by: int | None = None) -> np.ndarray:
+    """Of a function of the positions q [joints M], or of its derivative by one of them."""
+    total = zero = np.zeros(q.shape[1])
+    for term in function:
+        factor = np.prod([numbers[name] ** power for name, power in term.powers], axis=0)
+        angle = sum((k * q[i] for i, k in enumerate(term.joints) if robot.joints[i] == HINGE), zero)
+        sine, cosine, a, b = np.sin(angle), np.cos(angle), float(term.cosine), float(term.sine)
+        turned, slides = a * cosine + b * sine, [
+            (i, e) for i, e in enumerate(term.joints) if robot.joints[i] != HINGE and e
+        ]  # fmt: skip
+        if by is not None and robot.joints[by] == HINGE:
+            turned = term.joints[by] * (b * cosine - a * sine)
+        for i, e in slides:
+            turned = turned * (q[i] ** e if i != by else e * q[i] ** (e - 1))
+        if by is not None and robot.joints[by] != HINGE and not term.joints[by]:
+            continue
+        total = total + factor * turned
+    return total
+
+
+def _solved(mass: list[list[np.ndarray]], right: list[np.ndarray]) -> np.ndarray:
+    """M^-1 b [joints M], motion by motion."""
+    if len(mass) == 1:
+        return (right[0] / mass[0][0])[None]
+    return np.linalg.solve(np.moveaxis(np.array(mass), 2, 0), np.array(right).T[..., None])[..., 0].T

@@ -19,7 +19,7 @@ from numpy.linalg import LinAlgError
 
 from rtcd_jax.certificate import check
 from rtcd_jax.certificate.check import Node, Refused, Undecided
-from rtcd_jax.certificate.falsify.robots import Drawn, draw, rate
+from rtcd_jax.certificate.falsify.robots import Drawn, after_reset, draw, rate
 from rtcd_jax.system.errors import UserError
 
 REPEATED = 16
@@ -108,12 +108,13 @@ class Motions:
         self.claim, self.beyond = claim, beyond
         self.plant, self.n, self.dt = claim.robot.name, claim.n, float(claim.dt)
         self._noise, self._age = _floats(claim.noise), beyond * float(claim.age)
-        self.rest = float(check.read_goal(Node("goal", content["goal"]), claim).rest)
+        region = content["goal"] if claim.catch is None else content["claim"]["catch"]
+        self.rest = 0.0 if claim.catch else float(check.read_goal(Node("goal", region), claim).rest)
         self._x, self._rates, self._u, self._gains = map(_floats, (claim.x, claim.rates, claim.u, claim.K))
         self._shifts = [(shift.powers, _floats(shift.x), _floats(shift.rates)) for shift in claim.shifts]
         self._goal, self._goal_gain = _floats(claim.x_goal), _floats(claim.K_goal)
         self._bounds = np.array([np.inf if b is None else float(b) for b in claim.bounds])
-        self._outward = np.linalg.inv(_floats(Node("goal.axes", content["goal"]["axes"]).array(self.n, self.n)))
+        self._outward = np.linalg.inv(_floats(Node("axes", region["axes"]).array(self.n, self.n)))
         self.intervals = [
             Ellipsoids(p.knot, float(p.start), float(p.end), *map(_floats, (p.first, p.last, p.bend)))
             for p in intervals
@@ -158,7 +159,7 @@ class Motions:
             flight.again[:] = np.where(np.arange(0, count, REPEATED) >= before, x[:, ::REPEATED], flight.again)
             self._through(interval, interval.start, flight, slice(0, before), steps)
             self._through(interval, fraction, flight, slice(before, after), steps)
-        arrived, growth = self._settle(flight, steps)
+        arrived, growth = self._settle(flight, steps) if self.claim.catch is None else self._catch(flight)
         return MotionResults(flight.level, flight.share_of_limit, growth, arrived, flight.error)
 
     def _through(self, interval: Ellipsoids, start: float, flight: "_Flight", who: slice, steps: int) -> None:
@@ -208,6 +209,14 @@ class Motions:
             if not moving.size:
                 break
         return arrived, growth
+
+    def _catch(self, flight: "_Flight") -> tuple[np.ndarray, np.ndarray]:
+        """Whether every motion is in the catch set at t_N, or behind the reset; nothing grows."""
+        assert self.claim.catch is not None
+        center, _, reset = self.claim.catch
+        x = flight.x if reset is None else after_reset(self.claim.robot, reset, flight.drawn, flight.x)
+        level = np.linalg.norm(self._outward @ (x - _floats(center)[:, None]), axis=0)
+        return level <= 1, np.zeros(len(level))
 
     def goal_level(self, x: np.ndarray) -> np.ndarray:
         """|y| [M] of states in the goal region's coordinates."""

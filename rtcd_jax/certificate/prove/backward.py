@@ -52,11 +52,11 @@ class Tier(NamedTuple):
         """An interval's; `degrees` are those in the robot's numbers."""
         return (self.time_order, self.order, *((self.stride, *degrees) if claim.shifts else ()))
 
-    def shapes(self, todo: dict[str, Obligation], loop: Loop, fewest: int, bernstein: int) -> dict[str, list[Shape]]:
+    def shapes(self, todo: dict[str, Obligation], claim: Claim, fewest: int, bernstein: int) -> dict[str, list[Shape]]:
         """Of the programs of each case, the cheapest first: of every degree from `fewest` on, then the tier's own;
         `bernstein` is the degree in s.
         """
-        further = program.of_the_angles(loop.n, len(loop.hinges), self.degree) if self.further else ()
+        further = program.of_the_angles(claim.n, len(claim.robot.hinges), self.degree) if self.further else ()
         lower = [(degree, ()) for degree in range(fewest, self.degree + self.further)]
         sizes: list[tuple[int, program.Monomials]] = [*lower, (self.degree, further)]
         return {
@@ -203,7 +203,7 @@ class BackwardProof:
     def outlet(self, rho: float) -> ProofState:
         """The state at which the proof begins: t_N with the level rho."""
         last = len(self.loop.u) - 1
-        return ProofState(last, 1.0, rho, on_grid(self.loop.axes(last, 1.0, rho, 0.0)[0]), self._rates[0], 1.0, {}, {})
+        return ProofState(last, 1.0, rho, self.loop.outlet_axes(rho), self._rates[0], 1.0, {}, {})
 
     def intervals_from(self, state: ProofState) -> Iterator[Proved]:
         """The proved intervals from the state back to t = 0, or to where nothing can be proved."""
@@ -256,7 +256,7 @@ class BackwardProof:
             if self.claim.first_order:
                 check.require_jump(self.claim, interval, "jumps")
             interval, todo, tier = self._models(interval, decay_margin)
-            shapes = tier.shapes(todo, self.loop, FEWEST, self._strategy.bernstein)
+            shapes = tier.shapes(todo, self.claim, FEWEST, self._strategy.bernstein)
             halved = state.halved if k % FROM_THE_CHEAPEST else {}
             if self.claim.shifts and k % FROM_THE_CHEAPEST:  # of their many programs
                 shapes = {case: _from(each, state.sizes.get(case, (0, 0))) for case, each in shapes.items()}

@@ -1,4 +1,4 @@
-"""One elite's certificate: goal region, then funnel. A journal keeps every step, so that a killed proof goes on."""
+"""One elite's certificate: goal region or catch, then funnel. A journal keeps all steps: a killed proof goes on."""
 
 import contextlib
 import hashlib
@@ -18,7 +18,8 @@ from rtcd_jax.certificate.check import Claim, Halves, Node, Refused, Squares
 from rtcd_jax.certificate.enlarge import all_knots as joint
 from rtcd_jax.certificate.enlarge import knot_by_knot as backward
 from rtcd_jax.certificate.prove.backward import BackwardProof, ProofState, Proved
-from rtcd_jax.certificate.prove.closed_loop import Loop, claim_of, double, doubles, with_digests
+from rtcd_jax.certificate.prove.catch import caught_end
+from rtcd_jax.certificate.prove.closed_loop import Loop, claim_of, double, matrix_record, with_digests
 from rtcd_jax.certificate.prove.goal import GoalRegion, goal_region
 from rtcd_jax.certificate.prove.levels import leveled, unit_directions
 from rtcd_jax.certificate.prove.margins import feedback_delay, push_margin
@@ -97,7 +98,7 @@ def certify_elite(
     target: str = "certificates",
     threads: int = 1,
 ) -> Outcome | None:
-    """Writes NAME.json into a run's folder `target`; None if not even a goal region can be shown.
+    """Writes NAME.json into a run's folder `target`; None if not even a goal region, or the catch, can be shown.
 
     `optimize_value` chooses the ellipsoids' shapes so that the funnel is large. The certificate bears what the run
     bore, or another `uncertainty`, or that of a file. `solver` is by cvxpy's name. With a `share` below 1 no level is
@@ -135,9 +136,15 @@ def _certified(
     elite = Elite.read(run, name)
     if optimize_value and elite.keep_out:
         raise UserError(f"--optimize_value: {run} has sets to keep out of (task.keep_out), which it does not know")
+    if optimize_value and elite.caught:
+        raise UserError(f"--optimize_value: {run} ends in a catch set (task.catch), whose shape is given")
     if optimize_value and share < 1:
         raise UserError("--optimize_value: has no sampled levels of which --share could be a part")
     bounds, folder = bounds_of(elite, uncertainty_of(elite, uncertainty)), run / target
+    if bounds.age and elite.caught:
+        raise UserError(
+            f"{run} ends in a catch set (task.catch): no proof of it bears old measurements, uncertainty.age"
+        )
     loop_record = claim_of(elite, bounds)
     misfits: tuple[Any, ...] = ()
     if bounds.age:
@@ -151,17 +158,18 @@ def _certified(
     def checking(done: int, of: int) -> None:
         on_step(Checking(name, done, of))
 
-    if (content := _finished(folder / f"{name}.json", head, elite, checking)) is not None:
+    if (content := _finished(folder / f"{name}.json", head, loop_record, elite, checking)) is not None:
         return _outcome(name, content, elite, guarantee, math.nan)
     claim = _read(loop_record, elite)
     loop, exact = Loop(claim, elite, *misfits, share=share), guarantee == "proved"
     journal = Journal(folder / f".{name}.partial.jsonl", head)
     if optimize_value:
         loop = _shaped(loop, journal)
-    region = _region(claim, loop, exact, bounds.rest, journal, solver, pool)
-    if region is None:
+    last = "goal" if claim.catch is None else "catch"
+    ended = _end(claim, loop, exact, bounds.rest, journal, last, solver, pool)
+    if ended is None:
         return None
-    goal, outlet = region
+    end, outlet = ended
     proof = BackwardProof(claim, loop, exact, solver, pool)
     state = _resumed(proof, claim, outlet, journal)
     for proved in proof.intervals_from(state):
@@ -187,16 +195,18 @@ def _certified(
         "version": check.VERSION,
         "claim": with_digests({**loop_record, "start": start, "push": double(push)}),
         "funnel": intervals,
-        "goal": goal,
+        last: end,
         "notes": {"elite": name, "rung at writing": guarantee, "solver": solver, TASK: check.digest(head)},
     }
     content = with_digests(content)
-    _write(folder / f"{name}.json", content, guarantee, checking)
+    write_certificate(folder / f"{name}.json", content, guarantee, checking)
     journal.close()
     return _outcome(name, content, elite, guarantee, seconds)
 
 
-def _write(path: Path, content: dict[str, Any], guarantee: str, progress: Callable[[int, int], None]) -> None:
+def write_certificate(
+    path: Path, content: dict[str, Any], guarantee: str, progress: Callable[[int, int], None]
+) -> None:
     """Writes the certificate; one that says *proved* after the checker has accepted the whole file."""
     file = (json.dumps(content, separators=(",", ":")) + "\n").encode()
     if guarantee == "proved":
@@ -206,12 +216,18 @@ def _write(path: Path, content: dict[str, Any], guarantee: str, progress: Callab
 
 
 def _finished(
-    path: Path, head: Mapping[str, Any], elite: Elite, progress: Callable[[int, int], None]
+    path: Path,
+    head: Mapping[str, Any],
+    loop_record: Mapping[str, Any],
+    elite: Elite,
+    progress: Callable[[int, int], None],
 ) -> dict[str, Any] | None:
     """The certificate that is there, if it is of this task, whole, and as good as it says; None if it is to be made."""
     with contextlib.suppress(OSError, ValueError, TypeError, KeyError, AttributeError, RecursionError, Refused):
         content = check.parse(path.read_bytes())
         claim = {key: value for key, value in content["claim"].items() if key not in ("start", "push", "sha256")}
+        if elite.caught:  # behind a reset there is another set
+            claim["catch"] = loop_record["catch"]
         whole = with_digests({key: value for key, value in content.items() if key != "sha256"}) == content
         ours = content["notes"].get(TASK) == check.digest(head) and check.digest(claim) == head["claim"]
         if whole and ours and (head["rung"] != "proved" or standing_of(path, elite, progress).proved):
@@ -223,8 +239,9 @@ def _outcome(name: str, content: Mapping[str, Any], elite: Elite, guarantee: str
     """A certificate beside what was sampled."""
     claim = check.read_claim(Node("claim", content["claim"]))
     intervals = [check.read_interval(Node("funnel", each), claim) for each in content["funnel"]]
-    axes = Node("goal.axes", content["goal"]["axes"]).array(claim.n, claim.n)
-    volumes, _ = check.volumes_of(claim, intervals, axes)
+    region = content["goal"] if claim.catch is None else content["claim"]["catch"]
+    volumes, _ = check.volumes_of(claim, intervals, Node("axes", region["axes"]).array(claim.n, claim.n))
+    volumes.setdefault("goal", volumes["outlet"])  # as the searches have it for a motion that ends in a catch
     start = float(intervals[0].knot + intervals[0].start)
     per_knot, step = elite.volumes_per_knot[int(np.ceil(start)) :], float(elite.time[1])
     sampled = {
@@ -242,19 +259,25 @@ def _read(loop_record: Mapping[str, Any], elite: Elite) -> Claim:
     return check.read_claim(Node("claim", with_digests({**loop_record, **nothing})))
 
 
-def _region(
-    claim: Claim, loop: Loop, exact: bool, rest: float, journal: Journal, solver: str, pool: Executor | None
+def _end(
+    claim: Claim, loop: Loop, exact: bool, rest: float, journal: Journal, last: str, solver: str, pool: Executor | None
 ) -> tuple[dict[str, Any], float] | None:
-    """The goal's record and the outlet's level, from the journal if it has them."""
+    """The record of the goal or the catch, the `last` of the two, and the outlet's level; from the journal if it has
+    them.
+    """
     for line in journal.lines:
-        if "goal" in line:
-            return line["goal"], line["outlet"]
-    region = goal_region(claim, loop, exact, rest, solver, pool)
-    if region is None:
+        if last in line:
+            return line[last], line["outlet"]
+    if claim.catch is None:
+        region = goal_region(claim, loop, exact, rest, solver, pool)
+        record = None if region is None else _goal_record(region)
+    else:
+        region = caught_end(claim, loop, exact, solver, pool)
+        record = None if region is None else catch_end_record(region.order, region.cases)
+    if region is None or record is None:
         return None
-    goal = _goal_record(region)
-    journal.append({"goal": goal, "outlet": region.outlet})
-    return goal, region.outlet
+    journal.append({last: record, "outlet": region.outlet})
+    return record, region.outlet
 
 
 def _shaped(loop: Loop, journal: Journal) -> Loop:
@@ -293,12 +316,12 @@ def _interval_record(interval: check.Interval) -> dict[str, Any]:
             "knot": interval.knot,
             "start": double(interval.start),
             "end": double(interval.end),
-            "first": _matrix(interval.first),
-            "last": _matrix(interval.last),
-            "bend": [_matrix(each) for each in interval.bend],
+            "first": matrix_record(interval.first),
+            "last": matrix_record(interval.last),
+            "bend": [matrix_record(each) for each in interval.bend],
             "orders": list(interval.orders),
             "cases": _cases_record(interval.cases),
-            **({"late": _matrix(interval.late)} if interval.late else {}),
+            **({"late": matrix_record(interval.late)} if interval.late else {}),
             **_sides_record(interval.sides),
         }
     )
@@ -312,14 +335,18 @@ def _goal_record(region: GoalRegion) -> dict[str, Any]:
         with_digests({"start": double(s.start), "end": double(s.end), "cases": _cases_record(s.cases)})
         for s in region.shells
     ]
-    record = {"axes": _matrix(region.axes), "order": region.order, "weight": double(weight)}
+    record = {"axes": matrix_record(region.axes), "order": region.order, "weight": double(weight)}
     late = {"late": [double(c) for c in region.late]} if region.late else {}
     others = {**late, **_sides_record(region.sides)}
     return with_digests({**record, "rest": double(region.rest), "shells": shells, **others})
 
 
+def catch_end_record(order: int, cases: Mapping[str, Squares]) -> dict[str, Any]:
+    return with_digests({"order": order, "cases": _cases_record(cases)})
+
+
 def _sides_record(sides: list) -> dict[str, Any]:
-    return {"sides": [_matrix(each) for each in sides]} if sides else {}
+    return {"sides": [matrix_record(each) for each in sides]} if sides else {}
 
 
 def _cases_record(cases: Mapping[str, Squares]) -> dict[str, Any]:
@@ -335,10 +362,6 @@ def _squares_record(squares: Squares) -> Any:
         "multipliers": [[_triangle(matrix) for matrix in each] for each in squares.multipliers],
         **({"further": [list(each) for each in squares.further]} if squares.further else {}),
     }
-
-
-def _matrix(matrix: list[list]) -> Any:
-    return doubles([[float(c) for c in row] for row in matrix])
 
 
 def _triangle(matrix: list[list]) -> list[str]:

@@ -21,6 +21,8 @@ from rtcd_jax.system.errors import UserError
 
 GRID = 34
 """Ellipsoids are rounded to multiples of 2^-34."""
+PIECES = 32
+"""Of the last interval of a motion that ends in a catch, in which V is carried."""
 ADVERSARIAL_DIRECTIONS, TRIES = 8, 40
 SEARCH_RADII = (0.2, 0.1, 0.05, 0.02)
 """The most adversarial directions of a sphere are improved by random steps: `TRIES` for each standard deviation."""
@@ -63,6 +65,7 @@ def claim_of(elite: Elite, bounds: Bounds | None = None) -> dict[str, Any]:
         "age": double(bounds.age),
         "speed": double(0.0),
         **loop,
+        **({"catch": _catch_record(elite)} if elite.caught else {}),
         **({"shifts": _shifts_record(robot, bounds, loop)} if bounds.moving else {}),
         **({"keep_out": [_set_record(each) for each in elite.keep_out]} if elite.keep_out else {}),
     }
@@ -97,9 +100,22 @@ def _loop_record(elite: Elite, robot: ClaimedRobot) -> dict[str, Any]:
         "rates": doubles(np.swapaxes(rates, 0, 1)),
         "u": doubles(u[:, 0]),
         "K": doubles(elite.K[:, 0]),
-        "x_goal": doubles(elite.x_goal),
-        "K_goal": doubles(elite.K_goal[0]),
+        **({} if elite.caught else {"x_goal": doubles(elite.x_goal), "K_goal": doubles(elite.K_goal[0])}),
     }
+
+
+def _catch_record(elite: Elite) -> dict[str, Any]:
+    """The set in which the elite's motion ends, without a reset."""
+    axes = on_grid(np.linalg.cholesky(np.linalg.inv(elite.S[-1]) * elite.rho[-1]))
+    return catch_record(doubles(elite.x_goal), matrix_record(axes))
+
+
+def catch_record(center: Any, axes: Any, **reset: Any) -> dict[str, Any]:
+    return with_digests({"center": center, "axes": axes, **reset})
+
+
+def matrix_record(matrix: list[list]) -> Any:
+    return doubles([[float(c) for c in row] for row in matrix])
 
 
 def _shifts_record(robot: ClaimedRobot, bounds: Bounds, loop: dict[str, Any]) -> list[dict[str, Any]]:
@@ -114,26 +130,27 @@ def _shifts_record(robot: ClaimedRobot, bounds: Bounds, loop: dict[str, Any]) ->
 
 def robot_record(robot: check.Robot) -> dict[str, Any]:
     """A robot as certificates write it."""
-
-    def function(terms: Any) -> list[dict[str, Any]]:
-        return [
-            {
-                "joints": list(each.joints),
-                "powers": dict(each.powers),
-                "cos": double(each.cosine),
-                "sin": double(each.sine),
-            }
-            for each in terms
-        ]
-
     functions = {
-        "mass": [[function(entry) for entry in row] for row in robot.mass],
-        "potential": function(robot.potential),
-        "damping": [function(each) for each in robot.damping],
-        "motor": [function(each) for each in robot.motor],
+        "mass": [[function_record(entry) for entry in row] for row in robot.mass],
+        "potential": function_record(robot.potential),
+        "damping": [function_record(each) for each in robot.damping],
+        "motor": [function_record(each) for each in robot.motor],
     }
     names = {"name": robot.name, "states": list(robot.states), "units": list(robot.units)}
     return with_digests({**names, "input_unit": robot.input_unit, "joints": list(robot.joints), **functions})
+
+
+def function_record(terms: check.Function) -> list[dict[str, Any]]:
+    """A function of the positions as certificates write it."""
+    return [
+        {
+            "joints": list(each.joints),
+            "powers": dict(each.powers),
+            "cos": double(each.cosine),
+            "sin": double(each.sine),
+        }
+        for each in terms
+    ]
 
 
 @final
@@ -141,7 +158,8 @@ class Loop:
     """The claimed loop in float64, and the value function that shapes its funnel.
 
     Between knots S is the cubic Hermite interpolant of S_k with the slopes of the policy's Riccati equation, unless
-    it is `shaped` anew. No level is above this `share` of the sampled ones, if it is below 1.
+    it is `shaped` anew; before a catch it is `_carried`. No level is above this `share` of the sampled ones, if it is
+    below 1.
     """
 
     def __init__(
@@ -158,7 +176,7 @@ class Loop:
         self.limits, self.disturbance = floats(claim.limits), float(claim.disturbance)
         self.limit, self.dt = float(self.limits.mean()), float(claim.dt)
         late = [check.input_error(claim, k) for k in range(len(claim.u))]
-        late_at_goal = check.error_under(claim, [claim.K_goal])
+        late_at_goal = check.error_under(claim, [claim.K_goal]) if claim.catch is None else check.Q(0)
         if claim.first_order:
             late = [
                 check.lateness(claim, error, check.rational(misfit), check.jumps_within_reach(claim, k, 0))
@@ -183,6 +201,33 @@ class Loop:
             for end in (0, 1):
                 a[k, end], b[k, end, :, 0] = linear(self.robot, self.parameters, self.x[k + end], u)
         self.slopes, self._linear = value_rates(elite, a, b), (a, b)
+        self._last = None if claim.catch is None else self._carried()
+
+    def _carried(self) -> tuple[np.ndarray, np.ndarray]:
+        """S [PIECES + 1 n n] and S' on the last interval of a motion that ends in a catch: carried from its first knot
+        on so that V stays the same in the linear loop.
+
+        The policy's S has a boundary layer there, since S_N is the catch's, and its gains are not between their knots
+        what those of that layer are.
+        """
+        k, s = len(self.u) - 1, self.values[-2]
+
+        def rate(fraction: float, s: np.ndarray) -> np.ndarray:
+            a, b = linear(self.robot, self.parameters, self.nominal(k, fraction)[0], self.u[k])
+            gain = (1 - fraction) * self.gains[k] + fraction * self.gains[k + 1]
+            carried = s @ (a - np.outer(b, gain))
+            return -(carried + carried.T)
+
+        values, rates = [s], [rate(0.0, s)]
+        for i in range(PIECES):
+            middle, step = (i + 0.5) / PIECES, self.dt / PIECES
+            second = rate(middle, s + step / 2 * rates[-1])
+            third = rate(middle, s + step / 2 * second)
+            fourth = rate((i + 1) / PIECES, s + step * third)
+            s = s + step / 6 * (rates[-1] + 2 * second + 2 * third + fourth)
+            values.append(s)
+            rates.append(rate((i + 1) / PIECES, s))
+        return np.array(values), np.array(rates)
 
     def late_row(self, k: int, fraction: float) -> np.ndarray:
         """rho [n]: how fast K e changes in the unsaturated loop is about rho e."""
@@ -230,6 +275,10 @@ class Loop:
 
     def value(self, k: int, fraction: float) -> tuple[np.ndarray, np.ndarray]:
         """S and S'."""
+        if self._last is not None and k == len(self.u) - 1:
+            values, rates = self._last
+            i = min(int(fraction * PIECES), PIECES - 1)
+            return hermite(fraction * PIECES - i, self.dt / PIECES, values[i], rates[i], values[i + 1], rates[i + 1])
         return hermite(fraction, self.dt, self.values[k], self.slopes[k, 0], self.values[k + 1], self.slopes[k, 1])
 
     def axes(self, k: int, fraction: float, rho: float, growth: float) -> tuple[np.ndarray, np.ndarray]:
@@ -249,6 +298,10 @@ class Loop:
         back, sign = np.argsort(order), np.ones(self.n)
         sign[-1] = np.linalg.det(np.eye(self.n)[order])  # of the permutation: det L > 0
         return c[back] * sign, c_rate[back] * sign
+
+    def outlet_axes(self, rho: float) -> list[list]:
+        """The exact L at t_N of this level."""
+        return on_grid(self.axes(len(self.u) - 1, 1.0, rho, 0.0)[0])
 
     def growth(self, k: int, fraction: float, rho: float, directions: np.ndarray) -> float:
         """The largest V' / V over the surface V = rho, searched from the sampled directions [n D]."""
@@ -334,6 +387,12 @@ class Loop:
                 touching = float((room / reach) ** 2)
             level = min(level, touching)
         return level
+
+    def caught_level(self) -> float:
+        """The largest level at t_N whose ellipsoid about the catch's center is in its set."""
+        assert self.claim.catch is not None
+        axes = floats(self.claim.catch.axes)
+        return float(np.linalg.eigvalsh(axes.T @ self.value(len(self.u) - 1, 1.0)[0] @ axes)[0])
 
     def goal_box_level(self) -> float:
         """As `box_level`; half a turn away is another equilibrium, which no goal region has in it."""

@@ -8,7 +8,7 @@ import numpy as np
 from rtcd_jax.certificate import check
 from rtcd_jax.certificate.check import Claim, Refused, Shell
 from rtcd_jax.certificate.prove.backward import Effort, Tier, prove
-from rtcd_jax.certificate.prove.closed_loop import Loop, on_grid
+from rtcd_jax.certificate.prove.closed_loop import Loop
 from rtcd_jax.certificate.prove.field import floats
 from rtcd_jax.certificate.prove.levels import goal_level, unit_directions
 from rtcd_jax.certificate.prove.sdp import SOLVER
@@ -79,7 +79,7 @@ def _at_level(
     pool: Executor | None,
 ) -> tuple[GoalRegion | None, float]:
     """The region of a level, and the error [1/s] of its models."""
-    axes = on_grid(loop.axes(len(loop.u) - 1, 1.0, rho, 0.0)[0])
+    axes = loop.outlet_axes(rho)
     waiting, shells, least, rest, error = [(0.0, 1.0)], [], np.inf, 0.0, np.inf
     try:
         late = loop.goal_late_row() if claim.first_order else []
@@ -91,7 +91,7 @@ def _at_level(
             if start or not claim.moves_the_goal:
                 todo = check.goal_obligations(claim, field, *ends)
                 error = max(float(each.error) for each in todo.values())
-                shapes = tier.shapes(todo, loop, tier.degree, tier.time_order)
+                shapes = tier.shapes(todo, claim, tier.degree, tier.time_order)
                 proof = prove(todo, shapes, ENOUGH, exact, Effort(directions, solver), pool)
             if proof is not None:
                 shells.append(Shell(*ends, proof[0]))

@@ -108,6 +108,17 @@ def goal_level(loop: Loop, directions: np.ndarray) -> float:
     return float(low)
 
 
+def last_level(loop: Loop, directions: np.ndarray) -> float:
+    """The level at t_N from which levels are carried back: the goal's, or that of the catch set, under the limits.
+
+    Raises:
+        Refused: V falls at no level about the goal.
+    """
+    if loop.claim.catch is None:
+        return goal_level(loop, directions)
+    return min(loop.caught_level(), BOX_FRACTION * loop.box_level(len(loop.u) - 1, 1.0))
+
+
 def carried_back(
     loop: Loop, k: int, start: float, end: float, rho: float, decay_margin: float, directions: np.ndarray
 ) -> Carried:
@@ -186,7 +197,9 @@ def _least_scale(missing: np.ndarray, room: np.ndarray, duration: float) -> tupl
     )
     require(solution.status == 0, "interval", "no cubic level follows the growth of V")
     rate = solution.x[:3]
-    return float(np.exp(-integrals[0] @ rate)), float(rate[0]), float(rate.sum())
+    by = float(np.exp(-integrals[0] @ rate))
+    require(by**2 > COLLAPSE, "interval", "the level vanishes")
+    return by, float(rate[0]), float(rate.sum())
 
 
 def leveled(loop: Loop, directions: np.ndarray) -> Loop:
@@ -195,7 +208,7 @@ def leveled(loop: Loop, directions: np.ndarray) -> Loop:
     Raises:
         Refused: the level vanishes, or V is not positive definite.
     """
-    rho, n = goal_level(loop, directions), len(loop.u)
+    rho, n = last_level(loop, directions), len(loop.u)
     values, slopes = loop.values.copy(), loop.slopes.copy()
     values[n] /= rho
     for k in range(n - 1, -1, -1):

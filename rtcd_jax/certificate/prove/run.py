@@ -21,7 +21,7 @@ from rtcd_jax.certificate.prove.closed_loop import claim_of
 from rtcd_jax.certificate.prove.sdp import SOLVER, require_solver
 from rtcd_jax.certificate.prove.uncertainty import bounds_of, uncertainty_of
 from rtcd_jax.elite.elite import Elite
-from rtcd_jax.elite.records import require_elites, require_held_goal
+from rtcd_jax.elite.records import require_elites
 from rtcd_jax.system.console import Clock, Console, Progress, table, times
 from rtcd_jax.system.files import in_turn, make_folder, read_json, replace_json
 from rtcd_jax.system.processes import CONTEXT, processes
@@ -93,7 +93,6 @@ def certify_run(
     """
     if solver != SOLVER:
         solver = require_solver(solver)
-    require_held_goal(folder, "certify")
     names = require_elites(folder)[:elites] if only is None else [only]
     for name in names:  # at once, and not from a worker
         elite = Elite.read(folder, name)
@@ -135,7 +134,7 @@ def certify_run(
         )
     for name in names:
         if outcomes[name] is None:
-            console.message(f"{name}: no goal region can be shown at any level that was tried")
+            console.message(f"{name}: no goal region or catch can be shown at any level that was tried")
     for outcome in finished:
         file = target / f"{outcome.elite}.json"
         console.message(f"stored: {file}; `rtcd check {file}` checks it")

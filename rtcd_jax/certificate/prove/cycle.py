@@ -1,0 +1,109 @@
+"""A cycle of tasks, closed by proof: the reset at the end of each leads into the first proved ellipsoid of the next."""
+
+import copy
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from rtcd_jax.certificate import check
+from rtcd_jax.certificate.check import Claim, Node, Refused
+from rtcd_jax.certificate.prove.catch import catch_proof, largest_level
+from rtcd_jax.certificate.prove.certify import catch_end_record, write_certificate
+from rtcd_jax.certificate.prove.closed_loop import catch_record, with_digests
+from rtcd_jax.certificate.prove.reset import reset_of, reset_record
+from rtcd_jax.certificate.standing import certificate_path
+from rtcd_jax.elite.elite import Elite
+from rtcd_jax.elite.records import task_folders
+from rtcd_jax.system.console import Console, Progress
+from rtcd_jax.system.files import read_json
+
+_ADVICE = "remove it, and certify the run again"
+
+
+class Motion(NamedTuple):
+    """A task's certificate: its file and what it holds, its elite, its claim, and the axes of its ends."""
+
+    path: Path
+    content: dict[str, Any]
+    elite: Elite
+    claim: Claim
+    first: list
+    last: list
+
+    @classmethod
+    def of(cls, folder: Path, name: str) -> "Motion":
+        """Raises UserError if there is none, or one that cannot be read."""
+        path = certificate_path(folder, name)
+        content = read_json(path, _ADVICE)
+        claim = check.read_claim(Node("claim", content["claim"]))
+        first, last = (check.read_interval(Node("funnel", content["funnel"][i]), claim) for i in (0, -1))
+        return cls(path, content, Elite.read(folder, name), claim, first.first, last.last)
+
+
+def close_cycle(run: Path, names: Sequence[str], guarantee: str, solver: str, console: Console) -> bool:
+    """Closes the cycles of a run's elites, and says which; True if all of them are.
+
+    Every task's certificate is written anew with what the reset makes of its last ellipsoid. Those whose funnels are
+    not there from t = 0 on stay as they are.
+
+    Raises:
+        UserError: certificates that cannot be read, or a robot whose reset no claim knows.
+    """
+    closed = [_closed(run, name, guarantee, solver, console) for name in names]
+    return all(closed)
+
+
+def _closed(run: Path, name: str, guarantee: str, solver: str, console: Console) -> bool:
+    folders = task_folders(run)
+    there = [folder for folder in folders if certificate_path(folder, name).is_file()]
+    motions = [Motion.of(folder, name) for folder in there]
+    begun = [folder.name for folder, motion in zip(there, motions, strict=True) if motion.claim.start == (0, 0)]
+    if missing := [folder.name for folder in folders if folder.name not in begun]:
+        console.message(f"elite {name}: no cycle, since the funnel of {missing[0]} is not shown from t = 0 on")
+        return False
+    followed = list(zip(folders, motions, [*motions[1:], motions[0]], strict=True))
+    written, closed = [], True
+    for folder, motion, ahead in followed:
+        content, level = _led(motion, ahead, guarantee, solver)
+        written.append(content)
+        if content is None:
+            closed = False
+            console.message(
+                f"elite {name}: no cycle, the reset after {folder.name} is not shown to lead into the next funnel: V "
+                f"is up to {level:.3g} of its first level, must be below 1; it is smaller with a smaller --share"
+            )
+    if not closed:
+        return False
+
+    def checking(done: int, of: int) -> None:
+        console.progress(Progress(done, of, f"elite {name}  checking the file, interval {done}/{of}"))
+
+    for motion, content in zip(motions, written, strict=True):
+        if content != motion.content:
+            write_certificate(motion.path, content, guarantee, checking)
+    motions = [Motion.of(folder, name) for folder in folders]
+    check.require_cycle([(motion.claim, motion.first) for motion in motions])
+    files = " ".join(str(motion.path) for motion in motions)
+    console.message(f"elite {name}: the cycle is closed ({guarantee}); `rtcd check --cycle {files}` checks it")
+    return True
+
+
+def _led(motion: Motion, ahead: Motion, guarantee: str, solver: str) -> tuple[dict[str, Any] | None, float]:
+    """A motion's certificate with its reset into the first ellipsoid of the motion that is ahead, None where that is
+    not shown; and the largest level there of a state that is led.
+    """
+    content = copy.copy(motion.content)
+    center, axes = ahead.content["claim"]["x"][0], ahead.content["funnel"][0]["first"]
+    about = {key: value for key, value in content["claim"].items() if key != "sha256"}
+    about["catch"] = catch_record(center, axes, reset=reset_record(reset_of(motion.elite, ahead.elite)))
+    if with_digests(about) == content["claim"]:
+        return content, 0.0
+    claim = check.read_claim(Node("claim", with_digests(about)))
+    try:
+        cases = catch_proof(claim, motion.last, guarantee == "proved", solver)
+    except Refused:
+        cases = None
+    if cases is None:
+        return None, largest_level(claim, motion.last)
+    content |= {"claim": with_digests(about), "catch": catch_end_record(*cases)}
+    return with_digests({key: value for key, value in content.items() if key != "sha256"}), 0.0
