@@ -18,7 +18,7 @@ class ProvedFunnel:
     """E(t) = {x*(t) + L(t) y : |y| <= 1} of a certificate.
 
     Piece i begins at `begins`[i], in knots, and L = sum_j `axes`[i, j] s^j there, with s from -1 to 1 until the next
-    one begins. The last piece is the goal's region, for all time. `rates` are x*' at both ends of every interval. Of a
+    one begins. The last piece is the goal's region, for all time, or the ellipsoid at a catch. `rates` are x*' at both ends of every interval. Of a
     certificate about own motions these are the nominal robot's ellipsoids, and `offsets` [pieces] bounds the |y| of
     other robots' centers in them.
     """
@@ -40,9 +40,10 @@ class ProvedFunnel:
             begins.append(float(interval.knot + interval.start))
             first, last, (bend_0, bend_1) = map(_floats, (interval.first, interval.last, interval.bend))
             axes.append([(first + last) / 2 + bend_0, (last - first) / 2 + bend_1, -bend_0, -bend_1])
-        goal = _floats(read_goal(Node("goal", content["goal"]), claim).axes)
+        caught = claim.catch is not None
+        last = _floats(intervals[-1].last if caught else read_goal(Node("goal", content["goal"]), claim).axes)
         begins.append(float(len(claim.u)))
-        axes.append([goal, 0 * goal, 0 * goal, 0 * goal])
+        axes.append([last, 0 * last, 0 * last, 0 * last])
         return cls(np.array(begins), np.array(axes), _floats(claim.rates), np.array([*offsets, 0.0]))
 
     def of_all_robots(self) -> "ProvedFunnel":

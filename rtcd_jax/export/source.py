@@ -148,9 +148,10 @@ first one has {inlet}) failed to arrive with a probability of at most {at_most},
     proved = f"{standing.volumes['inlet']:.4g} {unit}"
     own = bundle.proof.offsets.any()
     shared, whose = (", what of it all robots share", "its robot's funnel") if own else ("", "it")
+    ends = "is in the catch set at the end, or led by the reset" if bundle.elite.caught else "comes to the goal"
     return f"""\
 The monitor evaluates the **proved** funnel from {standing.start:.6g} s on{shared}: every motion of the model that is
-inside at some time stays in {whose} and comes to the goal, in continuous time, within the limits. Its first ellipsoid
+inside at some time stays in {whose} and {ends}, in continuous time, within the limits. Its first ellipsoid
 has {proved}. `certificate.json` is the proof, and `rtcd check certificate.json` checks it. The
 SHA-256 of its claim about this controller stands in the controllers, too:
 `{standing.claim}`.

@@ -37,7 +37,10 @@ def _records(content):
     robot = claim.get("robot") if isinstance(claim, dict) else None
     parts = claim.get("shifts") if isinstance(claim, dict) else None
     lists.append(parts if isinstance(parts, list) else [])
-    for record in (robot, *lists.pop(), claim, *(record for each in lists for record in each), goal, content):
+    catch = claim.get("catch") if isinstance(claim, dict) else None
+    reset = catch.get("reset") if isinstance(catch, dict) else None
+    of_claim = (robot, *lists.pop(), reset, catch, claim)
+    for record in (*of_claim, *(record for each in lists for record in each), goal, content.get("catch"), content):
         if isinstance(record, dict):
             yield record
 

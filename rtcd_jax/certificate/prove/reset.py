@@ -41,8 +41,8 @@ def reset_record(reset: Reset) -> dict[str, Any]:
     """A reset as certificates write it."""
     return with_digests(
         {
-            "positions": reset.positions,
-            "turns": reset.turns,
+            "positions": [[*row] for row in reset.positions],
+            "turns": [*reset.turns],
             "numbers": {name: a if isinstance(a, str) else double(float(a)) for name, a in reset.numbers.items()},
             "momentum": [[function_record(entry) for entry in row] for row in reset.momentum],
         }
