@@ -18,9 +18,9 @@ class ProvedFunnel:
     """E(t) = {x*(t) + L(t) y : |y| <= 1} of a certificate.
 
     Piece i begins at `begins`[i], in knots, and L = sum_j `axes`[i, j] s^j there, with s from -1 to 1 until the next
-    one begins. The last piece is the goal's region, for all time, or the ellipsoid at a catch. `rates` are x*' at both ends of every interval. Of a
-    certificate about own motions these are the nominal robot's ellipsoids, and `offsets` [pieces] bounds the |y| of
-    other robots' centers in them.
+    one begins. The last piece is the goal's region, for all time, or the ellipsoid at a catch. `rates` are x*' at both
+    ends of every interval. Of a certificate about own motions these are the nominal robot's ellipsoids, and `offsets`
+    [pieces] bounds the |y| of other robots' centers in them.
     """
 
     begins: Float[np.ndarray, " pieces"]

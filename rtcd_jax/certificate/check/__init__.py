@@ -16,9 +16,13 @@ folder and nothing else. Read it in this order:
     keep_out    sets of states to keep out of
     push        the largest impulse
     goal        the obligations of the goal region
+    catch       the obligation of a motion that ends in a catch set, or with a reset
     version1    the two robots that files of version 1 name
-    file        the file's text into exact numbers
-    verdict     every obligation of a certificate, and what follows
+    node        the file's text, its numbers exact
+    file        the file's parts
+    verdict     every obligation of a certificate
+    sentence    what follows, in plain words
+    cycle       motions that follow one another
     command     `rtcd check`
 
 THEOREM. The claim holds a robot: its mass matrix M, potential, dampers and one motor, whose numbers p lie in a box (at
@@ -36,6 +40,10 @@ G = {x_g + L_g y : |y| <= 1} of the certificate, every motion that is in E(t) at
 t_N, is then in G, never leaves G, and comes and stays as close to x_g as reported; in E and G no state exceeds its
 limit or is in a set of the claim's `keep_out`; and c_p(t) + M^-1 (motor) J is in E(t) for all t of [start, t_N] and
 |J| <= `push`. At t = 0 c_p is x*(0) for all p.
+A claim that ends in a `catch` says nothing of u after t_N, and has no G but C = {c + L_c y : |y| <= 1}: every such
+motion is in C at t_N, or, if there is a `reset`, q+ = P q + pi k and v+ = M+(q+)^-1 X(q) v are, with the claimed P, k
+and X and M+ the mass matrix of the robot with the claimed numbers after it. Where of several accepted files each C is
+E(0) of the next one, about the robot of these numbers (cycle.py), a robot goes from funnel to funnel.
 
 PROOF. *Funnel.* In y, d/dt |y|^2 = 2 y'L^-1 (f - c_p' - L'y). Let L = L(s), s in [-1, 1] the time of one interval,
 det L > 0; det M > 0 is shown for all angles and robots (robot.py). Then q = -2 c y' adj(L) (a + b (u + w) -
@@ -59,6 +67,8 @@ a gap).
 l >= rest. Where no w, noise or age acts, rest = 0, and q is divided by l^2 where u is free: the remainder of q is
 r l^2 + d l, where d bounds what does not vanish with l (x_g is a rounded multiple of pi), and |y| decreases wherever
 l > d / margin.
+*Catch.* With D = det M+, or 1, |L_c^-1 (x+ - c)| < 1 is q = (D det L_c)^2 - |adj(L_c) (D x+ - D c)|^2 > 0, in which
+there is no quotient, at all x = c_p(t_N) + l L_N z, l in [0, 1], |z| = 1; and where q > 0, M+ has an inverse.
 *Own motions.* With shifts u_lin = u_k - K (c_p - x* + L y). The conditions of a case are loosened by the largest
 |K (c_p - x*)|, so that they are the same for all robots and hold wherever they do for one. Terms of high order in y and
 p go to the remainder, and so does what p loses where its powers above a degree are replaced by lower ones (|T_k| <= 1).
@@ -92,16 +102,7 @@ from rtcd_jax.certificate.check.exact import (
     root_up,
     up,
 )
-from rtcd_jax.certificate.check.file import (
-    Node,
-    count_terms,
-    digest,
-    parse,
-    read_bytes,
-    read_claim,
-    read_goal,
-    read_interval,
-)
+from rtcd_jax.certificate.check.file import count_terms, read_claim, read_goal, read_interval
 from rtcd_jax.certificate.check.funnel import (
     Interval,
     Motion,
@@ -127,6 +128,7 @@ from rtcd_jax.certificate.check.goal import (
 )
 from rtcd_jax.certificate.check.keep_out import Ellipsoid, HalfSpace
 from rtcd_jax.certificate.check.matrix import cofactors
+from rtcd_jax.certificate.check.node import Node, digest, parse, read_bytes
 from rtcd_jax.certificate.check.push import push_clearance, require_push
 from rtcd_jax.certificate.check.robot import (
     HINGE,
@@ -140,6 +142,7 @@ from rtcd_jax.certificate.check.robot import (
     numbers_of,
 )
 from rtcd_jax.certificate.check.saturation import Case, Feedback, are_joined, cases_of, error_under, input_error
+from rtcd_jax.certificate.check.sentence import sentence
 from rtcd_jax.certificate.check.squares import (
     GramCertificate,
     Halves,
@@ -157,5 +160,5 @@ from rtcd_jax.certificate.check.squares import (
     reduced,
 )
 from rtcd_jax.certificate.check.taylor import Space, Taylor, economize, peak, polynomial, sine_and_cosine, terms_of
-from rtcd_jax.certificate.check.verdict import FORMAT, VERSION, Report, check, check_file, sentence, volumes_of
+from rtcd_jax.certificate.check.verdict import FORMAT, VERSION, Report, check, check_file, volumes_of
 from rtcd_jax.certificate.check.version1 import PLANTS, Plant

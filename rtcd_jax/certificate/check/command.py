@@ -10,8 +10,9 @@ from pathlib import Path
 
 from rtcd_jax.certificate.check.cycle import cycle_sentence, require_cycle
 from rtcd_jax.certificate.check.exact import Refused, Undecided, printable
-from rtcd_jax.certificate.check.file import parse, read_bytes
-from rtcd_jax.certificate.check.verdict import Report, check_file, sentence
+from rtcd_jax.certificate.check.node import parse, read_bytes
+from rtcd_jax.certificate.check.sentence import sentence
+from rtcd_jax.certificate.check.verdict import Report, check_file
 
 SECONDS = 600.0
 """For a stranger's file; the cart-pole's take 40 with python-flint."""
