@@ -16,7 +16,9 @@ from rtcd_jax import rollout
 from rtcd_jax.analysis.disturb import disturb_run
 from rtcd_jax.analysis.replay.replay import replay_run
 from rtcd_jax.analysis.report.motion import boundary_motions
+from rtcd_jax.certificate import check
 from rtcd_jax.certificate.prove.run import certify_run
+from rtcd_jax.certificate.standing import standing
 from rtcd_jax.config import load as configuration
 from rtcd_jax.elite.closed_loop import ClosedLoop, runge_kutta, simulate
 from rtcd_jax.elite.elite import Elite
@@ -38,6 +40,7 @@ from rtcd_jax.system.files import replace, replace_json
 from rtcd_jax.types import Status
 from rtcd_jax.validation import Dynamics, SamplingBudget
 from tests import linear_system as linear
+from tests.consoles import Output
 
 WEIGHT = 0.07
 STEERED = linear.policy([3.0, -2.0, 1.0, -4.0, 2.0, 0.5, -1.0, 2.0, -3.0, 1.0], 0.05)
@@ -223,13 +226,24 @@ def run(tmp_path):
 def test_what_goes_on_after_the_last_knot_refuses(run):
     verbs = {
         "disturb": lambda: disturb_run(run, 10, 0, silent()),
-        "certify": lambda: certify_run(run, 1, "proved", 1, silent()),
         "refine": lambda: refine_run(run, 1, ("gains",), 1, silent()),
     }
     for verb, start in verbs.items():
         with pytest.raises(UserError, match=rf"ends in a catch set \(task\.catch\): rtcd {verb} needs a goal"):
             start()
     assert sorted(path.name for path in run.iterdir()) == ["config.yaml", "elites", "format.json"]
+
+
+@pytest.mark.thorough
+def test_a_run_that_ends_in_a_catch_set_is_proved(run):
+    """Though S has a boundary layer before the catch, where the gain on the speed grows from 4.6 to 89 in one interval."""
+    output = Output()
+    assert certify_run(run, 1, "proved", 1, output.console)
+    report = check.check_file(run / "certificates" / "000.json")
+    assert report.start == 0
+    np.testing.assert_allclose(report.axes["catch"], [0.2, 1.0], rtol=1e-6)
+    assert report.volumes["inlet"] > 0.1 * elite().volumes_per_knot[0]
+    assert standing(run, "000").proved
 
 
 @pytest.mark.thorough

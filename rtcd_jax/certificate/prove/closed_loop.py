@@ -5,6 +5,7 @@ from copy import copy
 from typing import Any, cast, final
 
 import numpy as np
+from scipy.linalg import expm
 from scipy.optimize import brentq
 
 from rtcd_jax.certificate import check
@@ -23,6 +24,8 @@ GRID = 34
 """Ellipsoids are rounded to multiples of 2^-34."""
 PIECES = 32
 """Of the last interval of a motion that ends in a catch, in which V is carried."""
+NARROWEST = 16.0
+"""Times the sum of S at its knots, by which S may grow there."""
 ADVERSARIAL_DIRECTIONS, TRIES = 8, 40
 SEARCH_RADII = (0.2, 0.1, 0.05, 0.02)
 """The most adversarial directions of a sphere are improved by random steps: `TRIES` for each standard deviation."""
@@ -203,31 +206,30 @@ class Loop:
         self.slopes, self._linear = value_rates(elite, a, b), (a, b)
         self._last = None if claim.catch is None else self._carried()
 
-    def _carried(self) -> tuple[np.ndarray, np.ndarray]:
-        """S [PIECES + 1 n n] and S' on the last interval of a motion that ends in a catch: carried from its first knot
-        on so that V stays the same in the linear loop.
+    def _carried(self) -> tuple[list[np.ndarray | None], np.ndarray]:
+        """On the last interval of a motion that ends in a catch, S [PIECES + 1 n n] at the ends of its pieces: carried
+        from the first knot on so that V stays the same in the linear loop, as long as it is not too narrow. By piece
+        that loop's A - B K in its middle, or None where V falls instead.
 
         The policy's S has a boundary layer there, since S_N is the catch's, and its gains are not between their knots
         what those of that layer are.
         """
         k, s = len(self.u) - 1, self.values[-2]
-
-        def rate(fraction: float, s: np.ndarray) -> np.ndarray:
-            a, b = linear(self.robot, self.parameters, self.nominal(k, fraction)[0], self.u[k])
-            gain = (1 - fraction) * self.gains[k] + fraction * self.gains[k + 1]
-            carried = s @ (a - np.outer(b, gain))
-            return -(carried + carried.T)
-
-        values, rates = [s], [rate(0.0, s)]
-        for i in range(PIECES):
-            middle, step = (i + 0.5) / PIECES, self.dt / PIECES
-            second = rate(middle, s + step / 2 * rates[-1])
-            third = rate(middle, s + step / 2 * second)
-            fourth = rate((i + 1) / PIECES, s + step * third)
-            s = s + step / 6 * (rates[-1] + 2 * second + 2 * third + fourth)
+        narrowest = np.linalg.cholesky(NARROWEST * (self.values[-2] + self.values[-1]))
+        loops, values = [], [s]
+        for middle in (np.arange(PIECES) + 0.5) / PIECES:
+            a, b = linear(self.robot, self.parameters, self.nominal(k, middle)[0], self.u[k])
+            loop = a - np.outer(b, (1 - middle) * self.gains[k] + middle * self.gains[k + 1])
+            back = expm(-loop * self.dt / PIECES)
+            s = back.T @ s @ back
+            inner = np.linalg.solve(narrowest, np.linalg.solve(narrowest, s).T)
+            widths, turned = np.linalg.eigh((inner + inner.T) / 2)
+            if narrow := bool(widths[-1] > 1):
+                axes = narrowest @ turned
+                s = (axes * np.minimum(widths, 1)) @ axes.T
+            loops.append(None if narrow else loop)
             values.append(s)
-            rates.append(rate((i + 1) / PIECES, s))
-        return np.array(values), np.array(rates)
+        return loops, np.array(values)
 
     def late_row(self, k: int, fraction: float) -> np.ndarray:
         """rho [n]: how fast K e changes in the unsaturated loop is about rho e."""
@@ -276,9 +278,15 @@ class Loop:
     def value(self, k: int, fraction: float) -> tuple[np.ndarray, np.ndarray]:
         """S and S'."""
         if self._last is not None and k == len(self.u) - 1:
-            values, rates = self._last
-            i = min(int(fraction * PIECES), PIECES - 1)
-            return hermite(fraction * PIECES - i, self.dt / PIECES, values[i], rates[i], values[i + 1], rates[i + 1])
+            piece = min(int(fraction * PIECES), PIECES - 1)
+            (loops, values), part = self._last, fraction * PIECES - piece
+            loop, first, last = loops[piece], values[piece], values[piece + 1]
+            if loop is None:
+                return (1 - part) * first + part * last, (last - first) * PIECES / self.dt
+            back = expm(-loop * part * self.dt / PIECES)
+            carried = back.T @ first @ back
+            falls = carried @ loop
+            return carried, -(falls + falls.T)
         return hermite(fraction, self.dt, self.values[k], self.slopes[k, 0], self.values[k + 1], self.slopes[k, 1])
 
     def axes(self, k: int, fraction: float, rho: float, growth: float) -> tuple[np.ndarray, np.ndarray]:
