@@ -236,7 +236,7 @@ def test_what_goes_on_after_the_last_knot_refuses(run):
 
 @pytest.mark.thorough
 def test_a_run_that_ends_in_a_catch_set_is_proved(run):
-    """Though S has a boundary layer before the catch, where the gain on the speed grows from 4.6 to 89 in one interval."""
+    """Though S has a boundary layer before the catch: the gain on the speed grows from 4.6 to 89 in one interval."""
     output = Output()
     assert certify_run(run, 1, "proved", 1, output.console)
     report = check.check_file(run / "certificates" / "000.json")

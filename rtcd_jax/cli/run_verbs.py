@@ -325,7 +325,8 @@ class CertifyOptions(Options):
     """Prove the funnels of a run's best elites by sums of squares; `rtcd check` checks what this writes.
 
     Guarantees: certified, by the solver's floating-point numbers; proved, by exact arithmetic for the true dynamics.
-    The same command goes on after a kill. Exit code 1 if a funnel was not shown from t = 0 to the goal.
+    The same command goes on after a kill. Exit code 1 if a funnel was not shown from t = 0 to the goal or the catch, or
+    a cycle of tasks was not closed.
 
     Example: rtcd certify checkpoints/pendulum_rtcd --elites 8 --optimize_value
     """
@@ -357,17 +358,20 @@ class CertifyOptions(Options):
 
 
 def certify(options: CertifyOptions, console: Console) -> Exit:
-    from rtcd_jax.certificate.prove.cycle import close_cycle
+    from rtcd_jax.certificate.prove.cycle import close_cycle, foresee
     from rtcd_jax.certificate.prove.run import certify_run
     from rtcd_jax.elite.records import elite_name, is_cycle, require_elites
 
     workers, only = options.workers or cores(), None if options.elite is None else elite_name(options.elite)
     how = options.optimize_value, options.uncertainty, options.solver, options.share, only
     with heeding_sigterm():
+        cyclic = is_cycle(options.run)
+        names = require_elites(options.run)[: options.elites] if only is None else [only]
+        if cyclic:
+            foresee(options.run, names, options.share, options.uncertainty, console)
         folders = _each_task(options.run, console)
         goals = [certify_run(each, options.elites, options.guarantee, workers, console, *how) for each in folders]
-        if is_cycle(options.run):
-            names = require_elites(options.run)[: options.elites] if only is None else [only]
+        if cyclic:
             goals.append(close_cycle(options.run, names, options.guarantee, options.solver, console))
         return _verdict(all(goals))
 

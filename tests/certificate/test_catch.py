@@ -364,6 +364,18 @@ def test_what_keeps_a_cycle_open_is_said(tasks, tmp_path, monkeypatch):
     assert "the reset after first is not shown to lead into the next funnel: V is up to" in output.getvalue()
 
 
+def test_a_cycle_that_will_hardly_close_is_told_before_its_proofs(tasks, tmp_path, monkeypatch):
+    """Velocities that a reset makes five times as large need ellipsoids that no share makes wide enough."""
+    output = Output()
+    cycle.foresee(tmp_path, ["000"], 1.0, None, output.console)
+    assert output.getvalue() == "", "these will"
+    faster = HELD._replace(momentum=(((Term((0,), (("l", 2), ("m", 1)), Q(5), Q(0)),),),))
+    monkeypatch.setattr(cycle, "reset_of", lambda elite, ahead: faster)
+    cycle.foresee(tmp_path, ["000"], 1.0, None, output.console)
+    assert "elite 000: the cycle will hardly close: after a reset V may be" in output.getvalue()
+    assert "no smaller --share seems to close it" in output.getvalue()
+
+
 def test_a_cycle_needs_its_files(capsys):
     assert check.main(["--cycle"]) == 2
     assert "--cycle: must be followed by the certificates of all its motions" in capsys.readouterr().err

@@ -23,7 +23,7 @@ from tests.certificate.test_hostile import hostile_files, lines_are_the_checker_
 
 FILES = Path(__file__).parent / "files"
 KINDS = ("version1", "version2_age", "box", "age", "cartpole", "two_joints", "two_joints_box", "box_and_age",
-         "further", "own_motions", "halves")  # fmt: skip
+         "further", "own_motions", "halves", "catch", "reset")  # fmt: skip
 """Certificates of every kind of claim; all but the first two end with the last intervals of a test's elite."""
 
 
@@ -57,7 +57,7 @@ ULP = 2.0**-52
 FACTORS = (1 + ULP, 1 - ULP, 1 + 2.0**-30, 1 - 2.0**-30, 1.0001, 0.9999, 1.01, 0.99, 1.3, 0.7, 4.0, -1.0, 0.0)
 STATEMENT = {
     "parameters", "limit", "disturbance", "noise", "age", "speed", "jerk", "reaction", "jumps", "push", "robot",
-    "state_limits", "K_goal", "x_goal", "start", "shifts",
+    "state_limits", "K_goal", "x_goal", "start", "shifts", "catch",
 }  # fmt: skip
 
 
@@ -116,8 +116,9 @@ def term_changed(content, dice):
     robot = content["claim"].get("robot")
     if robot is None:
         return ("claim", "robot of version 1")
+    reset = content["claim"].get("catch", {}).get("reset", {"momentum": []})
     functions = [
-        *(entry for row in robot["mass"] for entry in row),
+        *(entry for row in (*robot["mass"], *reset["momentum"]) for entry in row),
         robot["potential"],
         *robot["damping"],
         *robot["motor"],
@@ -139,18 +140,39 @@ def term_changed(content, dice):
     return ("claim", "terms")
 
 
+def reset_changed(content, dice):
+    """An integer of a reset, or whose value a number takes."""
+    reset = content["claim"].get("catch", {}).get("reset")
+    if reset is None:
+        return term_changed(content, dice)
+    kind = dice.randrange(3)
+    if kind == 2:
+        name = dice.choice(list(reset["numbers"]))
+        reset["numbers"][name] = dice.choice([*reset["numbers"], (0.5).hex()])
+    else:
+        row = dice.choice([reset["turns"], *reset["positions"]])
+        row[dice.randrange(len(row))] += dice.choice([-1, 1])
+    return ("claim", "reset")
+
+
 def case_changed(content, dice):
     """A case left out, under another name, in halves, or with another's proof; another degree, other monomials, other
     orders.
     """
-    piece = dice.choice([*content["funnel"], *content["goal"]["shells"]])
+    piece = dice.choice(
+        [*content["funnel"], *([content["catch"]] if "catch" in content else content["goal"]["shells"])]
+    )
     cases, kind = piece["cases"], dice.randrange(8)
     name, other = dice.choice(list(cases)), dice.choice(list(cases))
     squares = cases[name]
     if kind == 0:
         del cases[name]
     elif kind == 1:
-        cases[dice.choice(["free", "high", "low-", "free+late", "free/0", "low/1,1", "late"])] = cases.pop(name)
+        cases[
+            dice.choice(
+                ["free", "high", "low-", "free+late", "free/0", "low/1,1", "late", "caught", "caught/1", "caught-"]
+            )
+        ] = cases.pop(name)
     elif kind == 2:
         cases[name], cases[other] = cases[other], cases[name]
     elif kind == 3:
@@ -178,8 +200,10 @@ def mutated(text, dice, groups):
         part = number_changed(content, dice, groups)
     elif kind < 0.75:
         part = box_widened(content, dice)
-    elif kind < 0.9:
+    elif kind < 0.83:
         part = term_changed(content, dice)
+    elif kind < 0.9:
+        part = reset_changed(content, dice)
     else:
         part = case_changed(content, dice)
     return content, part

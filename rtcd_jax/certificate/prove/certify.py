@@ -253,6 +253,11 @@ def _outcome(name: str, content: Mapping[str, Any], elite: Elite, guarantee: str
     return Outcome(name, guarantee, start * step, len(intervals), seconds, sampled, volumes, elite.guarantee)
 
 
+def unproved(elite: Elite, uncertainty: Path | UncertaintyConfig | None = None) -> Claim:
+    """The claim about an elite that bears what its run bore, or another uncertainty; nothing of it is proved."""
+    return _read(claim_of(elite, bounds_of(elite, uncertainty_of(elite, uncertainty))), elite)
+
+
 def _read(loop_record: Mapping[str, Any], elite: Elite) -> Claim:
     """The claim, with nothing proved yet."""
     nothing = {"start": [len(elite.u) - 1, double(1.0)], "push": double(0.0)}

@@ -5,11 +5,14 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import numpy as np
+
 from rtcd_jax.certificate import check
-from rtcd_jax.certificate.check import Claim, Node, Refused
+from rtcd_jax.certificate.check import Catch, Claim, Node, Refused
 from rtcd_jax.certificate.prove.catch import catch_proof, largest_level
-from rtcd_jax.certificate.prove.certify import catch_end_record, write_certificate
-from rtcd_jax.certificate.prove.closed_loop import catch_record, with_digests
+from rtcd_jax.certificate.prove.certify import COARSER, catch_end_record, unproved, write_certificate
+from rtcd_jax.certificate.prove.closed_loop import Loop, catch_record, on_grid, with_digests
+from rtcd_jax.certificate.prove.levels import last_level, leveled, unit_directions
 from rtcd_jax.certificate.prove.reset import reset_of, reset_record
 from rtcd_jax.certificate.standing import certificate_path
 from rtcd_jax.elite.elite import Elite
@@ -18,6 +21,10 @@ from rtcd_jax.system.console import Console, Progress
 from rtcd_jax.system.files import read_json
 
 _ADVICE = "remove it, and certify the run again"
+LIKELY = 0.95
+"""Level after a reset below which a cycle is likely to be closed by proof."""
+LEAST = 1 / 64
+"""Part of the share down to which one is looked for."""
 
 
 class Motion(NamedTuple):
@@ -38,6 +45,49 @@ class Motion(NamedTuple):
         claim = check.read_claim(Node("claim", content["claim"]))
         first, last = (check.read_interval(Node("funnel", content["funnel"][i]), claim) for i in (0, -1))
         return cls(path, content, Elite.read(folder, name), claim, first.first, last.last)
+
+
+def foresee(run: Path, names: Sequence[str], share: float, uncertainty: Path | None, console: Console) -> None:
+    """Says which elites' cycles will hardly close at this share of the sampled levels, and at which one they may: by
+    levels that nothing proves yet. Of elites that are proved on every task nothing is said.
+    """
+    folders = task_folders(run)
+    for name in names:
+        if all(certificate_path(folder, name).is_file() for folder in folders):
+            continue
+        elites = [Elite.read(folder, name) for folder in folders]
+        claims = [unproved(elite, uncertainty) for elite in elites]
+        level, closes = _foreseen(claims, elites, share), share
+        if level < LIKELY:
+            continue
+        while closes > share * LEAST and not _foreseen(claims, elites, closes) < LIKELY:
+            closes /= 2
+        hint = (
+            f"--share {closes:.2g} may close it" if closes > share * LEAST else "no smaller --share seems to close it"
+        )
+        console.message(
+            f"elite {name}: the cycle will hardly close: after a reset V may be {level:.3g} of the next funnel's first "
+            f"level (sampled), must be below 1; {hint}"
+        )
+
+
+def _foreseen(claims: Sequence[Claim], elites: Sequence[Elite], share: float) -> float:
+    """The largest level in the next first ellipsoid after any of the resets; infinite where there is no funnel."""
+    directions, ends = unit_directions(claims[0].n)[:, ::COARSER], []
+    try:
+        for claim, elite in zip(claims, elites, strict=True):
+            loop = Loop(claim, elite, share=share)
+            ends.append(
+                (leveled(loop, directions).axes(0, 0.0, 1.0, 0.0)[0], loop.outlet_axes(last_level(loop, directions)))
+            )
+        levels = []
+        for i, (claim, (_, outlet)) in enumerate(zip(claims, ends, strict=True)):
+            ahead = (i + 1) % len(claims)
+            led = Catch(claims[ahead].x[0], on_grid(ends[ahead][0]), reset_of(elites[i], elites[ahead]))
+            levels.append(largest_level(claim._replace(catch=led), outlet))
+    except Refused:
+        return np.inf
+    return max(levels)
 
 
 def close_cycle(run: Path, names: Sequence[str], guarantee: str, solver: str, console: Console) -> bool:
