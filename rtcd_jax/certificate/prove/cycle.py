@@ -18,13 +18,14 @@ from rtcd_jax.certificate.standing import certificate_path
 from rtcd_jax.elite.elite import Elite
 from rtcd_jax.elite.records import task_folders
 from rtcd_jax.system.console import Console, Progress
+from rtcd_jax.system.errors import UserError
 from rtcd_jax.system.files import read_json
 
 _ADVICE = "remove it, and certify the run again"
 LIKELY = 0.95
 """Level after a reset below which a cycle is likely to be closed by proof."""
-LEAST = 1 / 64
-"""Part of the share down to which one is looked for."""
+HALVINGS = 6
+"""Of the share, among which one is looked for."""
 
 
 class Motion(NamedTuple):
@@ -42,8 +43,11 @@ class Motion(NamedTuple):
         """Raises UserError if there is none, or one that cannot be read."""
         path = certificate_path(folder, name)
         content = read_json(path, _ADVICE)
-        claim = check.read_claim(Node("claim", content["claim"]))
-        first, last = (check.read_interval(Node("funnel", content["funnel"][i]), claim) for i in (0, -1))
+        try:
+            claim = check.read_claim(Node("claim", content["claim"]))
+            first, last = (check.read_interval(Node("funnel", content["funnel"][i]), claim) for i in (0, -1))
+        except (Refused, KeyError, TypeError, IndexError) as error:
+            raise UserError(f"{path} is no certificate ({error}): {_ADVICE}") from None
         return cls(path, content, Elite.read(folder, name), claim, first.first, last.last)
 
 
@@ -57,14 +61,12 @@ def foresee(run: Path, names: Sequence[str], share: float, uncertainty: Path | N
             continue
         elites = [Elite.read(folder, name) for folder in folders]
         claims = [unproved(elite, uncertainty) for elite in elites]
-        level, closes = _foreseen(claims, elites, share), share
+        level = _foreseen(claims, elites, share)
         if level < LIKELY:
             continue
-        while closes > share * LEAST and not _foreseen(claims, elites, closes) < LIKELY:
-            closes /= 2
-        hint = (
-            f"--share {closes:.2g} may close it" if closes > share * LEAST else "no smaller --share seems to close it"
-        )
+        smaller = (share / 2**halvings for halvings in range(1, HALVINGS + 1))
+        closes = next((each for each in smaller if _foreseen(claims, elites, each) < LIKELY), None)
+        hint = "no smaller --share seems to close it" if closes is None else f"--share {closes:.2g} may close it"
         console.message(
             f"elite {name}: the cycle will hardly close: after a reset V may be {level:.3g} of the next funnel's first "
             f"level (sampled), must be below 1; {hint}"
