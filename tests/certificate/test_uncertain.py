@@ -81,8 +81,16 @@ def test_a_file_of_version_1_has_the_verdict_that_it_had(content):
 
 def test_a_file_of_version_1_proves_its_elite(tmp_path):
     file = tmp_path / "000.json"
-    file.write_bytes(gzip.decompress(VERSION_1.read_bytes()))
+    content = gzip.decompress(VERSION_1.read_bytes())
+    file.write_bytes(content)
     arrays, record = swing.elite()
+    for name, stored in json.loads(content)[
+        "claim"
+    ].items():  # bit by bit: another machine's integrator rounds otherwise
+        if name in ("x", "u", "K", "x_goal", "K_goal"):
+            value = np.reshape(floats(stored), arrays[name].shape)
+            np.testing.assert_allclose(value, arrays[name], rtol=1e-9)
+            arrays[name] = value
     assert standing_of(file, Elite.of(arrays, record)).proved
     heavier = {**record, "parameters": {**record["parameters"], "m": 0.7}}
     assert "parameters.m = 0.6 there, 0.7 in the elite" in standing_of(file, Elite.of(arrays, heavier)).reason
