@@ -13,7 +13,6 @@ from rtcd_jax.config.load import Config, differences
 from rtcd_jax.elite.records import (
     INITIAL,
     elite_names,
-    is_cycle,
     read_config,
     read_elite,
     read_generations,
@@ -126,12 +125,12 @@ def show_run(path: Path, console: Console) -> Iterator[str]:
         yield f"{words(search.objective)}, {over}: initial {first:.4g}, best {last:.4g} (sampled)"
         name = elite_names(path)[0]
         yield from resets_in_words(read_elite(path / "elites", name)[1])
-        if is_cycle(path):
-            why = open_cycle(path, name)
-            yield f"cycle: none proved, {why}; rtcd certify {path}" if why else "cycle: proved"
         for folder in task_folders(path):
             yield f"task {folder.name}:"
             yield from show_run(folder, console)
+        if task.catch.cyclic:
+            why = open_cycle(path, name)
+            yield f"cycle: none proved, {why}; rtcd certify {path}" if why else "cycle: proved"
         return
     run = read_run(path, console)
     if run.seconds is not None:

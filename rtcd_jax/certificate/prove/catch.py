@@ -9,8 +9,7 @@ from rtcd_jax.certificate import check
 from rtcd_jax.certificate.check import Claim, Refused, Squares
 from rtcd_jax.certificate.prove.backward import Effort, prove
 from rtcd_jax.certificate.prove.closed_loop import Loop
-from rtcd_jax.certificate.prove.field import floats
-from rtcd_jax.certificate.prove.goal import OUTLET_CLEARANCE, TIERS
+from rtcd_jax.certificate.prove.goal import OUTLET_CLEARANCE, TIERS, largest_offset
 from rtcd_jax.certificate.prove.levels import last_level, unit_directions
 from rtcd_jax.certificate.prove.sdp import SOLVER, data_of, lowest
 
@@ -31,9 +30,7 @@ def caught_end(
 ) -> CaughtEnd | None:
     """The largest outlet that is a little within the catch set; None where the centers of some robots are outside."""
     assert claim.catch is not None
-    inward = np.linalg.inv(floats(claim.catch.axes))
-    centers = (floats(check.last_centers(claim)) if claim.shifts else floats(claim.x[-1:])) - floats(claim.catch.center)
-    off = float(np.max(np.linalg.norm(centers @ inward.T, axis=1)))
+    off = largest_offset(claim, claim.catch.axes, claim.catch.center)
     if off >= 1:
         return None
     outlet = (1 - off) ** 2 * (1 - OUTLET_CLEARANCE) * last_level(loop, unit_directions(claim.n))

@@ -106,14 +106,14 @@ def _at_level(
                 return None, error
     except Refused:
         return None, error
-    off = largest_offset(claim, axes) if claim.shifts else 0.0
+    off = largest_offset(claim, axes, claim.x_goal) if claim.shifts else 0.0
     if off >= 1:
         return None, error
     outlet, sides = (1 - off) ** 2 * (1 - OUTLET_CLEARANCE) * rho, loop.goal_sides()
     return GoalRegion(rho, outlet, off, axes, tier.order, rest, shells[::-1], least, late, sides), error
 
 
-def largest_offset(claim: Claim, axes: list) -> float:
-    """The largest |y| in the goal region of a center at t_N."""
-    centers = floats(check.last_centers(claim)) - floats(claim.x_goal)
+def largest_offset(claim: Claim, axes: list, center: list) -> float:
+    """The largest |y| of a funnel's center at t_N in the ellipsoid {center + axes y}."""
+    centers = floats(check.last_centers(claim)) - floats(center)
     return float(np.max(np.linalg.norm(np.linalg.solve(floats(axes), centers.T), axis=0)))
